@@ -37,7 +37,7 @@ from omsm_ros.io.descriptions import (
 )
 from omsm_ros.io.folders import MEASUREMENT_FILES, result_folder
 from omsm_ros.pipelines.correct import Admission, StampJoining
-from omsm_ros.pipelines.history import record_in_catalogue
+from omsm_ros.pipelines.history import keep_measurement, record_in_catalogue
 from omsm_ros.pipelines.measure import measure
 from omsm_ros.pipelines.recording import Recording
 from omsm_ros.quantities import BUDGET, EXPOSURE, LAG, RADIUS, STAMP_DELAY, UNCERTAINTY
@@ -138,15 +138,11 @@ def _correct(args: argparse.Namespace) -> Facts:
             report=not args.no_report,
             origin=args.origin,
         )
-    warnings = record_in_catalogue(args.catalogue, lambda: _keep(args))
+    warnings = record_in_catalogue(
+        args.catalogue, lambda: keep_measurement(args.catalogue, args.out, args.bag)
+    )
     warnings = [*summary["warnings"], *warnings]
     return {**summary, "warnings": warnings, "out": str(args.out)}
-
-
-def _keep(args: argparse.Namespace) -> bool:
-    from omsm_ros.pipelines.history import keep_measurement
-
-    return keep_measurement(args.catalogue, args.out, args.bag)
 
 
 def _show_correct(summary: Facts) -> None:

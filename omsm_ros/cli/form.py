@@ -196,7 +196,10 @@ def compensate_form(
         before, change = _offsets(previous, x, y)
         share, total = check_last_cut(found, change), total + before
     columns = (x, y, total, found.uncertainty, *([found.offset] if previous else []))
-    _write_offsets(out, [values[known].tolist() for values in columns])
+    rows = zip(*(values[known].tolist() for values in columns), strict=True)
+    lines = (",".join(f"{value:.9g}" for value in row) for row in rows)
+    head = f"{_HEAD},change_m" if previous else _HEAD
+    save_text(out / COMPENSATION, "\n".join([head, *lines]) + "\n")
     path = {} if spiral is None else _along(spiral_offsets(found, *spiral), out)
     if cut is not None:
         rim = float(np.max(np.hypot(x, y)[known]))
@@ -218,12 +221,6 @@ def compensate_form(
         "sign": _SIGN,
         "not_evaluated": [] if measured.systematic else ["systematic errors of the measurement"],
     }
-
-
-def _write_offsets(out: Path, columns: list[list[float]]) -> None:
-    lines = (",".join(f"{value:.9g}" for value in row) for row in zip(*columns, strict=True))
-    head = _HEAD if len(columns) == _COLUMNS else f"{_HEAD},change_m"
-    save_text(out / COMPENSATION, "\n".join([head, *lines]) + "\n")
 
 
 def _offsets(previous: Path, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

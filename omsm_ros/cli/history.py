@@ -96,9 +96,10 @@ def _show_history(facts: Facts) -> None:
                 f"  {_when(row)}  {Path(row['bag']).name}  "
                 f"form {quantity(row['deviation_rms'], 'm')} rms  by {row['calibration'][:8]}"
             )
+        counts = (count(len(machine[kind])) for kind in ("calibrations", "measurements"))
         table(
             [
-                ("  calibrations, measurements", _counts(machine)),
+                ("  calibrations, measurements", ", ".join(counts)),
                 ("  drift of the lag per day", _drift(machine["delay"], "s")),
                 ("  drift of the static gain per day", _drift(machine["static_gain"], "")),
                 ("  drift of the form's rms per day", _drift(machine["deviation"], "m")),
@@ -116,10 +117,6 @@ def _show_history(facts: Facts) -> None:
 def _when(row: dict[str, Any]) -> str:
     """Return when a row was recorded; if unknown, when it was added."""
     return f"{row['recorded_at']} UTC" if row["recorded_at"] else f"added {row['added_at']} UTC"
-
-
-def _counts(machine: dict[str, Any]) -> str:
-    return f"{count(len(machine['calibrations']))}, {count(len(machine['measurements']))}"
 
 
 def _drift(found: dict[str, float] | None, unit: str) -> str:

@@ -79,12 +79,9 @@ _MODULES = {
 }
 
 
-def _module_of(command: str) -> str:
-    return next((module for module, words in _MODULES.items() if command in words), command)
-
-
+_MODULE_OF = {word: module for module, words in _MODULES.items() for word in words}
 TASKS: dict[str, dict[str, Word]] = {
-    task: {name: Word(_module_of(name), help) for name, help in catalogue(text).items()}
+    task: {name: Word(_MODULE_OF.get(name, name), help) for name, help in catalogue(text).items()}
     for task, text in _HELP.items()
 }
 WORDS = {name: word for words in TASKS.values() for name, word in words.items()}

@@ -126,7 +126,8 @@ def spectra_of(paths: Sequence[AnyBag], options: SpectrumOptions) -> list[Spectr
     Raises BagError for a bag without samples, CalibrationError for a calibration of another
     machine, DataError for a scan that is too short.
     """
-    names = _names(paths)
+    stems = [Path(str(path)).stem for path in paths]
+    names = [s if stems.count(s) == 1 else f"{s} ({k})" for k, s in enumerate(stems, 1)]
     read = [_read(path, name, options) for path, name in zip(paths, names, strict=True)]
     shaken = [
         acceleration_lines(*accelerations_of(r.acceleration)) if r.acceleration else None
@@ -152,11 +153,6 @@ def _cleaned(scan: SpectrumOfScan, options: SpectrumOptions) -> SpectrumOfScan:
     return scan
 
 
-def _names(paths: Sequence[AnyBag]) -> list[str]:
-    stems = [Path(str(path)).stem for path in paths]
-    return [stem if stems.count(stem) == 1 else f"{stem} ({k + 1})" for k, stem in enumerate(stems)]
-
-
 def _read(path: AnyBag, name: str, options: SpectrumOptions) -> ReadScan:
     how = CorrectionOptions(polarity=options.polarity, accept_other_rate=options.admission.override)
     with Recording(path) as recording:
@@ -164,7 +160,9 @@ def _read(path: AnyBag, name: str, options: SpectrumOptions) -> ReadScan:
         scan = CorrectedScan(recording, calibration, how, admission=options.admission)
         axes, parts = scan.read()
         account, period = scan.account.as_dict(), scan.sample_period
-        shaken = _acceleration(recording)
+        shaken = []
+        if recording.holds(bags.ACCELERATION_TOPIC):
+            shaken = [block for _, block in recording.bag.records(bags.ACCELERATION_TOPIC)]
     every = join_points(parts)
     points = every.part(slice(0, MOST_SAMPLES))
     height = points.height
@@ -176,13 +174,6 @@ def _read(path: AnyBag, name: str, options: SpectrumOptions) -> ReadScan:
     known = z[np.isfinite(z)]
     motion = density(known - np.mean(known), period)
     return ReadScan(signal, shaken, points, motion, account, len(every))
-
-
-def _acceleration(recording: Recording) -> list[AccelerationBlock]:
-    if not recording.holds(bags.ACCELERATION_TOPIC):
-        return []
-    blocks = [block for _, block in recording.bag.records(bags.ACCELERATION_TOPIC)]
-    return [b for b in blocks if isinstance(b, AccelerationBlock)]
 
 
 def cleaned_points(scan: SpectrumOfScan) -> SurfacePoints:

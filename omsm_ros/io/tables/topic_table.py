@@ -128,12 +128,13 @@ class TopicTable(ForeignTable):
                 expected = "unit: date" if is_date else "another unit than date"
                 raise FileError(f"{self}: {name!r} needs {expected} in the map")
         take = [_getter(field, self._kind) for field in fields]
+        timed = [field == LOG_TIME or field.endswith("stamp") for field in fields]
         rows: list[list[float]] = []
         for number, (logged_ns, message) in enumerate(self._messages()):
             found = [self._taken(get, message, logged_ns) for get in take]
             absent = [n for n, value in zip(names, found, strict=True) if value is None]
-            if absent and self._is_foreign_message(found, fields):
-                self.passed_over += 1
+            if absent and all(v is None or t for v, t in zip(found, timed, strict=True)):
+                self.passed_over += 1  # it has none of the columns
                 continue
             if absent:
                 raise FileError(
@@ -155,11 +156,6 @@ class TopicTable(ForeignTable):
             return get(message)
         except (LookupError, ValueError):
             return None
-
-    @staticmethod
-    def _is_foreign_message(found: Sequence[float | None], fields: Sequence[str]) -> bool:
-        pairs = zip(found, fields, strict=True)
-        return not any(v is not None for v, f in pairs if f != LOG_TIME and not f.endswith("stamp"))
 
 
 def _columns(names: Sequence[str], rows: list[list[float]]) -> dict[str, FloatArray]:
