@@ -2,10 +2,8 @@
 
 import argparse
 from argparse import SUPPRESS
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from omsm_ros.cli.arguments import (
     TABLE_SUFFIX,
@@ -196,18 +194,14 @@ def _show_predict(facts: Facts) -> None:
                                        "of the encoder included"),
             ("maximum speed", f"{_times(facts['speed_factor'])} this motion, limited by "
                               f"{facts['binding']}"),
-            *((f"  limit: {limit['name']}", _limit_text(limit)) for limit in facts["limits"]),
+            *((f"  limit: {one['name']}", f"{quantity(one['value'], one['unit'])} of "
+               f"{quantity(one['allowed'], one['unit'])}, maximum speed "
+               f"{_times(one['speed_factor'])}") for one in facts["limits"]),
             ("not evaluated", ", ".join(facts["not_evaluated"]) or "nothing"),
             *((name, facts[key]) for name, key in (("not judged", "left_out"), ("advice", "advice"))
               if facts[key]),
         ]
     )  # fmt: skip
-
-
-def _limit_text(limit: Mapping[str, Any]) -> str:
-    value, allowed, unit = limit["value"], limit["allowed"], limit["unit"]
-    fastest = _times(limit["speed_factor"])
-    return f"{quantity(value, unit)} of {quantity(allowed, unit)}, maximum speed {fastest}"
 
 
 def _times(factor: float) -> str:

@@ -12,7 +12,6 @@ from omsm_ros.cli.command import CliCommand, Facts, table, written
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows, registration_of
 from omsm_ros.core.form.compensation import (
     CutSurface,
-    ToolPath,
     check_last_cut,
     compensation,
     cut_path,
@@ -200,7 +199,11 @@ def compensate_form(
     lines = (",".join(f"{value:.9g}" for value in row) for row in rows)
     head = f"{_HEAD},change_m" if previous else _HEAD
     save_text(out / COMPENSATION, "\n".join([head, *lines]) + "\n")
-    path = {} if spiral is None else _along(spiral_offsets(found, *spiral), out)
+    path: dict[str, Any] = {}
+    if spiral is not None:
+        along = spiral_offsets(found, *spiral)
+        save_text(out / PATH, path_gcode(along))
+        path = {"path": PATH, "path_places": len(along.offset), "path_left_out": along.left_out}
     if cut is not None:
         rim = float(np.max(np.hypot(x, y)[known]))
         path |= _program(CutSurface(surface, found.x, found.y, total), rim, cut, out)
@@ -242,11 +245,6 @@ def _program(surface: Surface, rim: float, cut: NextCut, out: Path) -> dict[str,
     remark = f"cut at {cut.speed:g} rpm with a nose of {cut.tool_radius / MILLIMETRE_M:g} mm"
     save_text(out / CUT, program_of(planned, [remark], measures=False))
     return {"cut": CUT, "path_error": planned.error, "cut_duration": duration}
-
-
-def _along(path: ToolPath, out: Path) -> dict[str, Any]:
-    save_text(out / PATH, path_gcode(path))
-    return {"path": PATH, "path_places": len(path.offset), "path_left_out": path.left_out}
 
 
 def _warnings(sure: float, before: float, after: float) -> list[str]:

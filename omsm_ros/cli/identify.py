@@ -97,10 +97,6 @@ def _declare_use(add: Arguments) -> None:
     add("--plan", "PLAN.json", "plan of the multisine, as 'omsm plan multisine' writes it")
 
 
-def _of_calibration(origin: dict[str, object]) -> dict[str, object]:
-    return {name: value for name, value in origin.items() if name not in PART_ENTRIES}
-
-
 def _identify(args: argparse.Namespace) -> Facts:
     first = args.recordings[0]
     of_table = first.suffix.lower() == TABLE_SUFFIX
@@ -108,6 +104,7 @@ def _identify(args: argparse.Namespace) -> Facts:
     if of_table:
         return _of_tables(args)
     source, *further = args.input.split(",")
+    stated = {name: value for name, value in args.origin.items() if name not in PART_ENTRIES}
     motions, settings, recorded = _motions(args, further)
     if args.hold != BAND_LIMITED:
         records = [record_of_motion(motion) for motion in motions]
@@ -119,7 +116,7 @@ def _identify(args: argparse.Namespace) -> Facts:
         settings=settings,
         use=intended_use_of(args.scan, args.accuracy),
         origin=replace(
-            from_json(Origin, _of_calibration(args.origin), "origin"),
+            from_json(Origin, stated, "origin"),
             recorded_ns=recorded,
             software=f"omsm_ros {__version__}",
         ),

@@ -76,13 +76,17 @@ def measurement_at(
     if nominal is not None and options.register is None:
         height = deviation(points.x, points.y, points.height, nominal)
         points = replace(points, height=height)
+    summary = path / SUMMARY
+    calibration = ""  # not known
+    if summary.is_file():
+        calibration = str(read_result(summary, "summary").get("calibration", ""))
     measured = ComparedMeasurement(
         name=str(path),
         points=points,
         fields=_fields_file_of(path, points),
         common=options.uncertainty if points.uncertainty is None else None,
         drift=options.drift,
-        calibration=_calibration_of(path),
+        calibration=calibration,
     )
     if nominal is None or options.register is None:
         return measured
@@ -106,14 +110,6 @@ def _in_order(points: MeasuredPoints, drift: float | None) -> MeasuredPoints:
         "of the scan, state the drift, such as --drift 20e-9"
     )
     return replace(points, notes=(*points.notes, note)) if drift is None else points
-
-
-def _calibration_of(path: Path) -> str:
-    """Return the calibration of a result folder; empty if unknown."""
-    summary = path / SUMMARY
-    if not summary.is_file():
-        return ""
-    return str(read_result(summary, "summary").get("calibration", ""))
 
 
 def _fields_file_of(path: Path, points: MeasuredPoints) -> ScanFields | None:

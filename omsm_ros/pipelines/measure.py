@@ -141,7 +141,11 @@ def add_verdict(
         _, area = within_aperture(judgement.options.surface, register.aperture)
     if scan is not None and area is not None:
         scan = _within(scan, area)
-    doubts = [*_mismatch_text(done, judgement.options.surface), *done.faults]
+    doubts: list[str] = []
+    if (surface := judgement.options.surface) is not None:
+        x, y = (done.points[name].astype(np.float64) for name in "xy")
+        doubts += map(str, mismatch(x, y, done.points["height"], surface))
+    doubts += done.faults
     doubts += map(str, _losses(done))
     if scan is None or scan.turns < _LEAST_TURNS:
         systematic = summary["budget"]["systematic"]
@@ -304,13 +308,6 @@ def measure(
         publish_scan(out, summary, calibration, nominal, done.points)
     save_json(out / SUMMARY, summary)
     return summary
-
-
-def _mismatch_text(done: Correction, nominal: Surface | None) -> list[str]:
-    if nominal is None:
-        return []
-    x, y = (done.points[name].astype(np.float64) for name in "xy")
-    return [*map(str, mismatch(x, y, done.points["height"], nominal))]
 
 
 # Entries of the registration that the summary keeps.

@@ -166,7 +166,9 @@ def write_scans(
     paths = []
     for k, design in enumerate(designs):
         path, text = scan_program(design, nominal, bound, cycle, dialect)
-        save_text(out / f"scan_{k + 1}.csv", _csv(path))
+        columns = zip(path.time, path.x, path.height, path.c, strict=True)
+        rows = (f"{a:.6f},{b:.10f},{d:.12f},{e:.8f}" for a, b, d, e in columns)
+        save_text(out / f"scan_{k + 1}.csv", "\n".join([_HEAD, *rows]) + "\n")
         save_text(out / f"scan_{k + 1}.nc", text)
         paths.append(path)
     return paths
@@ -183,9 +185,3 @@ def scan_program(
     path = plan_path(partial(scan_path, design, nominal), design.duration, cycle, bound)
     turned = f"part turned on the chuck by {np.degrees(design.clocking):g} degrees"
     return path, path_gcode(path, [f"scan at {design.rpm:g} rpm", turned], dialect)
-
-
-def _csv(path: PlannedPath) -> str:
-    columns = zip(path.time, path.x, path.height, path.c, strict=True)
-    rows = (f"{a:.6f},{b:.10f},{d:.12f},{e:.8f}" for a, b, d, e in columns)
-    return _HEAD + "\n" + "\n".join(rows) + "\n"

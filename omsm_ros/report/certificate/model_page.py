@@ -94,10 +94,15 @@ def _sections(model: SampledModel, issue: Issue) -> list[Section]:
         ("samples received", count(part(certificate, "samples", "received"))),
         ("samples compared", count(part(certificate, "samples", "compared"))),
     ]
+    limits = limit_rows(part(certificate, "limits") or {})
     every = [
         Section("Record", (RECORD, CORRELATION), (Table("", (), known_rows(tests, 1)),)),
         Section("Poles", (), (_poles(certificate),)),
-        Section("Records", (), (_identity(model, issue), _limits(certificate))),
+        Section(
+            "Records",
+            (),
+            (_identity(model, issue), Table("Limits of the verdict", (), known_rows(limits, 1))),
+        ),
     ]
     return present(every, issue.figures)
 
@@ -124,9 +129,3 @@ def _identity(model: SampledModel, issue: Issue) -> Table:
         ("omsm_ros", issue.version or NOTHING),
     ]
     return Table("Identity", (), known_rows(rows, 1))
-
-
-def _limits(certificate: Mapping[str, Any]) -> Table:
-    limits = part(certificate, "limits")
-    rows = limit_rows(limits if isinstance(limits, Mapping) else {})
-    return Table("Limits of the verdict", (), known_rows(rows, 1))

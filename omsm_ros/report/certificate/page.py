@@ -15,7 +15,6 @@ from omsm_ros.core.lti.frequency_response import (
 )
 from omsm_ros.core.lti.modes import KnownMode, known_modes
 from omsm_ros.core.model_errors.families import CREEP, MODE
-from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.readable import NOTHING, measured, percent, plain, quantity
 from omsm_ros.report import style
 from omsm_ros.report.certificate import figures as certificate_figures
@@ -171,19 +170,16 @@ _CLOSING = (
 def certificate_figures_of(calibration: Calibration, fitted: FittedRecord) -> dict[str, bytes]:
     """Return PNG files for the page."""
     certificate = calibration.certificate
+    # Matplotlib leaves gaps at NaN, an edge's median does not.
+    bridged = np.where(np.isfinite(fitted.output), fitted.output, fitted.modelled)
     made = {
         BAND: certificate_figures.response_with_band(calibration, fitted.measured),
-        "step": step_response(fitted.time, fitted.input, _bridged(fitted), fitted.modelled),
+        "step": step_response(fitted.time, fitted.input, bridged, fitted.modelled),
         "residual": certificate_figures.residual(fitted, certificate.residual.noise_m),
     }
     if certificate.candidates:
         made["order"] = certificate_figures.order(certificate.candidates, certificate.structure)
     return {name: style.png(figure) for name, figure in made.items()}
-
-
-def _bridged(fitted: FittedRecord) -> FloatArray:
-    """Return ``values`` as they are: Matplotlib leaves gaps at NaN, an edge's median does not."""
-    return np.asarray(np.where(np.isfinite(fitted.output), fitted.output, fitted.modelled))
 
 
 def render(calibration: Calibration, issue: Issue) -> str:

@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure, FigureBase
-from matplotlib.image import AxesImage
 from matplotlib.patches import Polygon
 from matplotlib.ticker import MaxNLocator
 
@@ -132,19 +131,12 @@ def _draw_map(
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(5, integer=True))
     style.label(axes, x="x [mm]", y="y [mm]", title=title)
-    _colour_bar(image, bar, _clipped(raster, low, high), f"{quantity} [{unit}]")
-
-
-def _clipped(raster: Raster, low: float, high: float) -> str:
     below, above = np.nanmin(raster.image) < low, np.nanmax(raster.image) > high
-    return {(0, 0): "neither", (1, 0): "min", (0, 1): "max"}.get((int(below), int(above)), "both")
-
-
-def _colour_bar(image: AxesImage, place: Axes, extend: str, text: str) -> None:
-    bar = place.figure.colorbar(image, cax=place, extend=extend, ticks=MaxNLocator(7))
-    bar.outline.set_visible(False)
-    place.tick_params(labelsize=style.TEXT_PT, colors=style.MUTED, labelcolor=style.INK, length=2)
-    bar.set_label(text, fontsize=style.TEXT_PT, color=style.INK)
+    extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max"}.get((below, above), "both")
+    scale_bar = axes.figure.colorbar(image, cax=bar, extend=extend, ticks=MaxNLocator(7))
+    scale_bar.outline.set_visible(False)
+    bar.tick_params(labelsize=style.TEXT_PT, colors=style.MUTED, labelcolor=style.INK, length=2)
+    scale_bar.set_label(f"{quantity} [{unit}]", fontsize=style.TEXT_PT, color=style.INK)
 
 
 def profile(raw: Profile, corrected: Profile, *, title: str, position: str) -> Figure:
