@@ -116,7 +116,11 @@ class Recording:
             raise BagError(
                 f"{str(self.path)!r} has its topics but no samples on them; record a step test"
             )
-        axes, distance, *reference = (_first_seconds(blocks[topic], duration) for topic in topics)
+        if duration:
+            for name, stream in blocks.items():
+                end = stream[0].first_sample + duration / stream[0].sample_period if stream else 0
+                blocks[name] = [block for block in stream if block.first_sample < end]
+        axes, distance, *reference = (blocks[topic] for topic in topics)
         for name, stream in (("axis", axes), ("distance", distance)):
             check_period(name, stream, faster)
         return assemble(  # type: ignore[misc]
@@ -127,13 +131,6 @@ class Recording:
             by_stamps=by_stamps,  # type: ignore[arg-type]
             further=further,
         )
-
-
-def _first_seconds(blocks: list[Block], duration: float) -> list[Block]:
-    if duration == 0 or not blocks:
-        return blocks
-    end = blocks[0].first_sample + duration / blocks[0].sample_period
-    return [block for block in blocks if block.first_sample < end]
 
 
 def scan_data(

@@ -13,11 +13,7 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.ripple.accelerometer import (
-    AccelerationLines,
-    acceleration_lines,
-    accelerations_of,
-)
+from omsm_ros.core.ripple.accelerometer import acceleration_lines, accelerations_of
 from omsm_ros.core.ripple.density import BandStopped, Density, band_stop, density
 from omsm_ros.core.ripple.exposure import (
     Exposure,
@@ -243,7 +239,13 @@ def _scan_facts(
             "amplitude": float(np.median(studied.spectrum.amplitude_floor)),
         },
         "motion": _motion_facts(scan.read.motion, options.calibration),
-        "accelerometer": _acceleration_facts(studied.acceleration_lines),
+        "accelerometer": None
+        if (shaken := studied.acceleration_lines) is None
+        else {
+            "highest": shaken.highest,
+            "duration": shaken.duration,
+            "lines": [asdict(one) | {"displacement": one.displacement} for one in shaken.lines],
+        },
         "peaks": [
             _peak_facts(studied, row) | _on_the_part(studied, row, exposure, options.spot)
             for row in scan.named
@@ -270,13 +272,6 @@ def _motion_facts(motion: Density, calibration: Calibration | None) -> dict[str,
         "valid_up_to": calibration.valid_up_to,
         "outside_band_rms": beyond**0.5,
     }
-
-
-def _acceleration_facts(found: AccelerationLines | None) -> dict[str, Any] | None:
-    if found is None:
-        return None
-    lines = [asdict(line) | {"displacement": line.displacement} for line in found.lines]
-    return {"highest": found.highest, "duration": found.duration, "lines": lines}
 
 
 def _peak_facts(studied: StudiedScan, row: NamedLine) -> dict[str, Any]:

@@ -94,7 +94,8 @@ def _sections(model: SampledModel, issue: Issue) -> list[Section]:
         ("samples received", count(part(certificate, "samples", "received"))),
         ("samples compared", count(part(certificate, "samples", "compared"))),
     ]
-    limits = limit_rows(part(certificate, "limits") or {})
+    stated = part(certificate, "limits")
+    limits = limit_rows(stated if isinstance(stated, Mapping) else {})
     every = [
         Section("Record", (RECORD, CORRELATION), (Table("", (), known_rows(tests, 1)),)),
         Section("Poles", (), (_poles(certificate),)),

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.calibration.certificate import REJECTED, Certificate, UndetectedEntry, to_json
+from omsm_ros.core.calibration.certificate import REJECTED, Certificate, to_json
 from omsm_ros.core.identification.fitted_record import FittedRecord
 from omsm_ros.core.lti.frequency_response import (
     COVERAGE_FACTOR,
@@ -111,32 +111,20 @@ def shape_table(calibration: Calibration) -> Table:
     return Table("Shape of the response", ("", "within the valid range"), rows)
 
 
-def _size(term: UndetectedEntry) -> str:
-    if term.missed is None or term.family not in (CREEP, MODE):
-        return quantity(term.missed, "m")
-    return f"{percent(term.missed)} of the motion"
-
-
-def _family(term: UndetectedEntry) -> str:
-    if term.family == CREEP:
-        return f"{term.family} over {quantity(term.parameter, 's', 2)}"
-    if term.family == MODE:
-        return f"{term.family} at {quantity(term.parameter, 'Hz', 2)}"
-    return term.family
-
-
 def undetected_table(certificate: Certificate) -> Table:
     """Return the model errors that this test could not detect, and what they cost on a scan."""
     found = certificate.undetected
-    rows = [
-        (
-            _family(term),
-            _size(term),
-            quantity(term.missed_effect_on_scan_m, "m"),
-            quantity(term.effect_on_scan_m, "m"),
-        )
-        for term in found.terms
-    ]
+    rows = []
+    for term in found.terms:
+        family, size = term.family, quantity(term.missed, "m")
+        if term.missed is not None and family in (CREEP, MODE):
+            size = f"{percent(term.missed)} of the motion"
+        if family == CREEP:
+            family += f" over {quantity(term.parameter, 's', 2)}"
+        elif family == MODE:
+            family += f" at {quantity(term.parameter, 'Hz', 2)}"
+        effects = (quantity(v, "m") for v in (term.missed_effect_on_scan_m, term.effect_on_scan_m))
+        rows.append((family, size, *effects))
     further = (
         ("dwell that would show the slowest creep", quantity(found.plateau_needed_s, "s")),
         ("assumed: no relaxation slower than", quantity(found.slowest_creep_s, "s")),

@@ -3,13 +3,13 @@
 A row without a number is left out.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from omsm_ros.core.calibration.calibration import SCHEMA, Calibration
-from omsm_ros.core.calibration.certificate import CandidateFit, Certificate
+from omsm_ros.core.calibration.certificate import Certificate
 from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.readable import (
     NOTHING,
@@ -95,23 +95,14 @@ def order_table(certificate: Certificate) -> Table:
     """Return every structure that was tried."""
     candidates = sorted(certificate.candidates, key=lambda c: structure_text(c.structure))
     least = min((c.bic for c in candidates), default=0.0)
-    rows = [
-        (
-            structure_text(candidate.structure),
-            f"{candidate.bic - least:.1f}",
-            quantity(candidate.rms_m, "m", 5),
-            ", ".join(_remarks(candidate, least, certificate)),
-        )
-        for candidate in candidates
-    ]
+    rows = []
+    for one in candidates:
+        remarks = ["lowest BIC"] * (one.bic == least)
+        remarks += ["✓ chosen"] * (one.structure == certificate.structure)
+        size = quantity(one.rms_m, "m", 5)
+        text = structure_text(one.structure)
+        rows.append((text, f"{one.bic - least:.1f}", size, ", ".join(remarks)))
     return Table("Candidates", ("BIC above lowest", "residual, rms", ""), rows)
-
-
-def _remarks(candidate: CandidateFit, least: float, certificate: Certificate) -> Iterator[str]:
-    if candidate.bic == least:
-        yield "lowest BIC"
-    if candidate.structure == certificate.structure:
-        yield "✓ chosen"
 
 
 def gain_table(calibration: Calibration) -> Table:

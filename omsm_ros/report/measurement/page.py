@@ -194,20 +194,15 @@ def limits_table(summary: Mapping[str, Any]) -> Table:
     return Table("Limits of the motion", ("on this scan", "allowed", "maximum speed"), rows)
 
 
-def _temperature(stated: Mapping[str, Any]) -> str:
-    if not stated:
-        return NOTHING
-    change = quantity(stated.get("change"), "K", 2, True)
-    return f"{quantity(stated.get('mean'), '°C', 4)}, {change} from start to end"
-
-
 def provenance_table(summary: Mapping[str, Any]) -> Table:
     """Return recording, calibration and files of a result."""
-    admission = part(summary, "admission")
+    admission, warm = part(summary, "admission"), part(summary, "conditions", "temperature")
+    change = quantity((warm or {}).get("change"), "K", 2, True)
+    temperature = f"{quantity((warm or {}).get('mean'), '°C', 4)}, {change} from start to end"
     rows = [
         ("recording", str(part(summary, "bag") or NOTHING)),
         ("recorded", date_text_of_stamp(part(summary, "conditions", "recorded_ns"))),
-        ("temperature", _temperature(part(summary, "conditions", "temperature") or {})),
+        ("temperature", temperature if warm else NOTHING),
         ("calibration", str(part(summary, "calibration") or NOTHING)),
         ("age of the calibration", days(part(summary, "conditions", "calibration_age"))),
         ("overridden", "yes" if part(admission or {}, "overridden") else "no"),
