@@ -324,19 +324,14 @@ def _options(args: argparse.Namespace) -> list[str]:
     Raises ConfigurationError for options that the campaign sets for each bag.
     """
     for word in args.passed_on:
-        if taken := next((o for o in _DECIDED if _is_abbreviation(word, o)), None):
+        name = word.partition("=")[0]
+        if len(name) > _SHORTEST and (own := [o for o in _DECIDED if o.startswith(name)]):
             raise ConfigurationError(
-                f"{taken} is given after '--' as {shown(word)}; give it before, once for all bags"
+                f"{own[0]} is given after '--' as {shown(word)}; give it before, once for all bags"
             )
     if args.catalogue == os.environ.get(ADDRESS, ""):
         return list(args.passed_on)
     return [*args.passed_on, "--catalogue", args.catalogue]
-
-
-def _is_abbreviation(word: str, option: str) -> bool:
-    """Return True if a ``word`` of the command line is ``option`` or an abbreviation of it."""
-    name, _, _ = word.partition("=")
-    return len(name) > _SHORTEST and option.startswith(name)
 
 
 def _write_index(out: Path, title: str, entries: list[Entry], calibration: Path) -> None:

@@ -116,12 +116,6 @@ def interrupt_on_signal() -> Iterator[None]:
             signal.signal(one, signal.SIG_DFL)
 
 
-def end_by_signal(number: int) -> None:
-    """End this process by the signal ``number``, so that its parent sees the cause."""
-    signal.signal(number, signal.SIG_DFL)
-    os.kill(os.getpid(), number)
-
-
 _OUTPUTS = ("out", "plot", "report")
 _RECORDINGS = (".mcap", ".db3", ".bag")
 # Commands that may replace this input by their output, which is of the same kind.
@@ -309,8 +303,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return BAD_INPUT
     except KeyboardInterrupt as err:
         _warn(INTERRUPTION)
-        if isinstance(err, TerminationRequestedError):
-            end_by_signal(err.number)
+        if isinstance(err, TerminationRequestedError):  # its parent shall see the cause
+            signal.signal(err.number, signal.SIG_DFL)
+            os.kill(os.getpid(), err.number)
         return INTERRUPTED
     except BrokenPipeError:
         # The reader closed the pipe, so nothing more may be flushed to it at exit.

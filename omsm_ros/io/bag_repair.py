@@ -57,7 +57,10 @@ def repair(path: Path) -> Repair:
     Raises BagError if that exists, or if ``path`` is no MCAP bag or has no valid message, and then
     leaves no file; ``path`` itself is only read.
     """
-    parts = sorted(path.glob("*.mcap"), key=_number) if path.is_dir() else [path]
+    parts = [path]
+    if path.is_dir():  # with files _0, _1, … _10
+        numbers = {part: part.stem.rpartition("_")[2] for part in path.glob("*.mcap")}
+        parts = sorted(numbers, key=lambda p: (int(numbers[p]) if numbers[p].isdecimal() else 0, p))
     if not parts:
         raise BagError(
             f"{str(path)!r} holds no .mcap file; only MCAP is repaired, "
@@ -91,12 +94,6 @@ def _copy(parts: list[Path], file: GrowingFile, made: Repair) -> None:
     if not made.messages:
         why = made.lost[0] if made.lost else "nothing was recorded"
         raise BagError(f"{str(parts[0])!r} has no whole message to save ({why}); record it again")
-
-
-def _number(part: Path) -> tuple[int, str]:
-    """Return the number of a file of a rosbag2 folder, which ends in _0, _1, … _10."""
-    number = part.stem.rpartition("_")[2]
-    return (int(number) if number.isdecimal() else 0, part.name)
 
 
 def _check_magic(stream: IO[bytes], path: Path) -> None:

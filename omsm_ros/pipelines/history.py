@@ -101,13 +101,14 @@ class Catalogue:
     def add(self, table: str, row: Mapping[str, object]) -> bool:
         """Add a row to "calibrations" or "measurements"; False if one of its id is there."""
         target = self._tables[table]
+        now = datetime.now(tz=timezone.utc).replace(tzinfo=None, microsecond=0)
         with self._translated(), self._engine.begin() as connection:
             known = self._sql.select(target.c.id).where(target.c.id == row["id"])
             if connection.execute(known).first() is not None:
                 return False
             try:
                 with connection.begin_nested():
-                    connection.execute(target.insert().values(added_at=_now(), **row))
+                    connection.execute(target.insert().values(added_at=now, **row))
             except self._sql.exc.IntegrityError:
                 return False  # another writer was faster
         return True
@@ -199,10 +200,6 @@ def time_of(stamp_ns: int | None) -> datetime | None:
     return datetime.fromtimestamp(stamp_ns / NANOSECONDS_PER_S, tz=timezone.utc).replace(
         tzinfo=None
     )
-
-
-def _now() -> datetime:
-    return datetime.now(tz=timezone.utc).replace(tzinfo=None, microsecond=0)
 
 
 _CALIBRATION_FIGURES = (

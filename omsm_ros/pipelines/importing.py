@@ -287,7 +287,8 @@ class _Source:
         for piece in self._pieces():
             with named_errors(DataError, found.file, DataError):
                 rows = counter.count(piece)
-            skipped = np.diff(rows.counter, prepend=self._number(rows)) - 1
+            before = int(rows.counter[0]) - 1 if self._last is None else self._last
+            skipped = np.diff(rows.counter, prepend=before) - 1
             self._last = int(rows.counter[-1])
             found.missing += int(np.sum(skipped))
             found.rows += len(rows.counter)
@@ -295,10 +296,6 @@ class _Source:
             yield from self._made(piece, rows)
         found.repeated_names = self._table.repeated_names
         found.passed_over = self._table.passed_over
-
-    def _number(self, rows: TableRows) -> int:
-        """Return the trigger number before those of ``rows``."""
-        return int(rows.counter[0]) - 1 if self._last is None else self._last
 
     def _made(
         self, piece: Mapping[str, FloatArray], rows: TableRows

@@ -163,12 +163,14 @@ def load_column_map(path: Path | str) -> tuple[ColumnMap, TableForm]:
             float(content.get("start", 0.0)),
             tuple(float(value) for value in invalid if not isinstance(value, str)),
         )
+    names = mapped.names(CHANNELS)
     written = TableForm(
         content.get("delimiter", ","),
         content.get("decimal", "."),
         content.get("lines_before_names", 0),
         content.get("lines_after_names", 0),
-        _is_named(mapped),
+        # Without a line of names all columns are [0], [1], …
+        not names or not all(_BY_POSITION.fullmatch(name) for name in names),
         tuple(text for text in invalid if isinstance(text, str)),
         content.get("zone", ""),
     )
@@ -178,12 +180,6 @@ def load_column_map(path: Path | str) -> tuple[ColumnMap, TableForm]:
             "write delimiter: ';' or what the file has"
         )
     return mapped, written
-
-
-def _is_named(mapped: ColumnMap) -> bool:
-    """Return whether a text has a line of names; not if all columns are [0], [1], …"""
-    names = mapped.names(CHANNELS)
-    return not names or not all(_BY_POSITION.fullmatch(name) for name in names)
 
 
 def _column(channel: str, given: Mapping[str, Any]) -> Column:
