@@ -344,12 +344,7 @@ def _stop_facts(
 
 
 def publish_spectra(
-    paths: Sequence[AnyBag],
-    options: SpectrumOptions,
-    out: Path,
-    *,
-    report: bool = True,
-    progress: Progress = no_progress,
+    paths: Sequence[AnyBag], options: SpectrumOptions, out: Path, *, report: bool = True
 ) -> dict[str, Any]:
     """Analyse the scans, write the results into ``out``, and return ``spectrum.json``'s content."""
     kind = "band_stopped" if options.stop else "vibration_removed"
@@ -357,7 +352,7 @@ def publish_spectra(
     densities = [n.format(k + 1) for k in range(len(paths)) for _, n, _ in _DENSITIES]
     owned = (*clouds, *densities, *_files_before(out), REPORT, SPECTRUM)
     with result_folder(out, owned) as folder:
-        scans = spectra_of(paths, options, progress)
+        scans = spectra_of(paths, options)
         summary = summary_of(scans, options)
         files = {"spectrum": SPECTRUM}
         is_cleaned = options.stop or options.remove_vibration
@@ -370,7 +365,9 @@ def publish_spectra(
             for coordinate, name, units in _DENSITIES:
                 if coordinate == TIME or coordinate in scan.studied.coordinates:
                     files[f"density {k} over {coordinate}"] = name.format(k)
-                    _write_density(folder / name.format(k), scan.studied.density(coordinate), units)
+                    found = scan.studied.density(coordinate)
+                    columns = dict(zip(units, (found.frequency, found.density), strict=True))
+                    write_columns(folder / name.format(k), columns, csv=True)
         if report:
             # Imported on demand, because loading the figures takes longer than the analysis.
             from omsm_ros.report.spectrum import drawn, render
@@ -389,11 +386,6 @@ _DENSITIES = (
     (TIME, "density_{}.csv", ("frequency_Hz", "density_m2_per_Hz")),
     (PATH, "density_path_{}.csv", ("frequency_per_m", "density_m3")),
 )
-
-
-def _write_density(path: Path, found: Density, names: tuple[str, str]) -> None:
-    columns = dict(zip(names, (found.frequency, found.density), strict=True))
-    write_columns(path, columns, csv=True)
 
 
 def _files_before(out: Path) -> list[str]:
