@@ -108,3 +108,23 @@ def test_a_folder_without_the_yaml_is_an_error(launch, tmp_path):
 def test_what_has_no_emulator_is_named(launch):
     with pytest.raises(ValueError, match="'analog' has no emulator"):
         launch(emulated="true", device="analog")
+
+
+def test_a_recording_into_no_folder_is_an_error(launch, tmp_path):
+    with pytest.raises(FileNotFoundError, match="its folder does not exist"):
+        launch(record=str(tmp_path / "nowhere" / "scan.mcap"))
+
+
+@pytest.mark.parametrize(
+    ("given", "prefix"),
+    [
+        ({"namespace": "omsm"}, None),
+        ({"namespace": "/cell2/"}, "cell2/"),
+        ({"namespace": "cell2", "frame_prefix": "left_"}, "left_"),
+    ],
+)
+def test_each_further_cell_has_frames_of_its_own(launch, given, prefix):
+    nodes = launch(**given)
+    for name in ("confocal_driver", "corrector"):
+        more = [p for p in nodes[name].parameters if isinstance(p, dict)]
+        assert more == ([{"frame_prefix": prefix}] if prefix else [])
