@@ -1,6 +1,8 @@
 """The parts of a command: arguments, an action that returns facts, and how they are printed."""
 
 import argparse
+import os
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +10,7 @@ from typing import Any, TypeAlias
 
 from omsm_ros.cli.arguments import Arguments
 from omsm_ros.core.calibration.certificate import REJECTED
-from omsm_ros.errors import printable
+from omsm_ros.errors import one_line, printable
 
 Facts: TypeAlias = dict[str, Any]
 
@@ -45,6 +47,19 @@ def rejected(facts: Facts) -> str:
 def say(*words: str) -> None:
     """Print one line; control characters in it, which may come from outside, are escaped."""
     print(printable(" ".join(words)))
+
+
+def warn(text: str) -> None:
+    """Print one line to stderr; it is lost if stderr is closed."""
+    try:
+        print("omsm:", one_line(text), file=sys.stderr, flush=True)
+    except OSError:  # stderr is closed; the exit status still reports the error
+        os.dup2(null_device(), sys.stderr.fileno())
+
+
+def null_device() -> int:
+    """Return the open file that takes what nobody reads."""
+    return os.open(os.devnull, os.O_WRONLY)
 
 
 def say_lines(text: str) -> None:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from omsm_ros import __version__
 from omsm_ros.cli import INTERRUPTED, INTERRUPTION, interruptible
 from omsm_ros.cli.arguments import Arguments, OneLineParser
-from omsm_ros.cli.command import say, say_lines, table, written
+from omsm_ros.cli.command import null_device, say, say_lines, table, warn, written
 from omsm_ros.cli.words import TASKS, WORDS
 from omsm_ros.errors import (
     DEBUG,
@@ -30,7 +30,6 @@ from omsm_ros.errors import (
     FileError,
     OmsmError,
     defect,
-    one_line,
     shortened,
     too_many_open_files,
 )
@@ -299,20 +298,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         args.passed_on = passed_on
         return _run(args)
     except OmsmError as err:
-        _warn(too_many_open_files(err) or str(err))
+        warn(too_many_open_files(err) or str(err))
         return BAD_INPUT
     except KeyboardInterrupt as err:
-        _warn(INTERRUPTION)
+        warn(INTERRUPTION)
         if isinstance(err, TerminationRequestedError):  # its parent shall see the cause
             signal.signal(err.number, signal.SIG_DFL)
             os.kill(os.getpid(), err.number)
         return INTERRUPTED
     except BrokenPipeError:
         # The reader closed the pipe, so nothing more may be flushed to it at exit.
-        os.dup2(_null_device(), sys.stdout.fileno())
+        os.dup2(null_device(), sys.stdout.fileno())
         return DONE
     except MemoryError as err:
-        _warn(f"out of memory: {err or 'none is left'}; process less data at once")
+        warn(f"out of memory: {err or 'none is left'}; process less data at once")
         return BAD_INPUT
     except Exception as err:
         if os.environ.get(DEBUG):
@@ -325,7 +324,7 @@ def _make_writable() -> None:
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:  # closed by the parent process
-            setattr(sys, name, os.fdopen(_null_device(), "w"))
+            setattr(sys, name, os.fdopen(null_device(), "w"))
         elif isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # file names may be any bytes
 
@@ -333,14 +332,14 @@ def _make_writable() -> None:
 def _report_internal_error(err: Exception) -> int:
     """Print an unexpected error; return the exit status."""
     if short := too_many_open_files(err):
-        _warn(short)
+        warn(short)
         return BAD_INPUT
     if isinstance(err, OSError) and (err.filename is not None or err.errno in _DISK_ERRORS):
         # The system refuses a path: a name too long, no permission, a broken disk.
         path = "a file" if err.filename is None else shown(os.fsdecode(err.filename))
-        _warn(f"{path}: {err.strerror}; check the path, its permissions and the disk")
+        warn(f"{path}: {err.strerror}; check the path, its permissions and the disk")
         return BAD_INPUT
-    _warn(defect(err))
+    warn(defect(err))
     return DEFECT
 
 
@@ -369,7 +368,7 @@ def _run(args: argparse.Namespace) -> int:
         facts = args.run.act(args)
     _tell(args, facts)
     if refusal := args.run.refusal(facts):
-        _warn(refusal)
+        warn(refusal)
         return BAD_INPUT
     return DONE
 
@@ -384,19 +383,8 @@ def _tell(args: argparse.Namespace, facts: Facts) -> None:
     except OSError as err:
         if isinstance(err, BrokenPipeError) or err.filename is not None:
             raise
-        os.dup2(_null_device(), sys.stdout.fileno())  # the rest would fail again at exit
+        os.dup2(null_device(), sys.stdout.fileno())  # the rest would fail again at exit
         raise FileError(
             f"cannot write to standard output: {err.strerror}; the command itself is done; free "
             "space there, or redirect the output"
         ) from err
-
-
-def _warn(text: str) -> None:
-    try:
-        print("omsm:", one_line(text), file=sys.stderr, flush=True)
-    except OSError:  # stderr is closed; the exit status still reports the error
-        os.dup2(_null_device(), sys.stderr.fileno())
-
-
-def _null_device() -> int:
-    return os.open(os.devnull, os.O_WRONLY)

@@ -1,14 +1,13 @@
 """Commands for recordings: record a device; inspect or repair a bag; import other recordings."""
 
 import argparse
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from omsm_ros.cli.arguments import Arguments, cell_of
-from omsm_ros.cli.command import CliCommand, Facts, say, table, written
+from omsm_ros.cli.command import CliCommand, Facts, say, table, warn, written
 from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
 from omsm_ros.errors import ConfigurationError, Notice
 from omsm_ros.io import bags
@@ -182,7 +181,7 @@ def _record(args: argparse.Namespace) -> Facts:
         return bool(args.seconds and samples * period >= args.seconds)
 
     def waits(reason: str) -> None:
-        print(f"omsm: {reason}; waiting for the first, Ctrl+C ends it", file=sys.stderr)
+        warn(f"{reason}; waiting for the first, Ctrl+C ends it")
 
     return record_device(given, args.out, ended, waits)
 
