@@ -2,6 +2,7 @@
 
 import queue
 import threading
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from enum import Enum
@@ -12,7 +13,8 @@ from omsm_ros.instruments.blocks import BlockPair
 
 # Requests of other threads wait for a read to end, so it is short [s].
 _READ_S = 0.05
-# The pause before connecting again doubles from the first to the second [s].
+# The time from one connection to the next doubles from the first, which is the least pause between
+# them, to the second [s].
 BACK_OFF_S = (0.25, 1.0)
 
 
@@ -89,11 +91,12 @@ class DeviceReader:
 
     def run(self, stop: threading.Event) -> None:
         """Read until ``stop``."""
-        pause = self._back_off[0]
+        least = pause = self._back_off[0]
         while not stop.is_set():
+            began = time.monotonic()
             if self._read_once(stop):
-                pause = self._back_off[0]
-            if stop.wait(pause):
+                pause = least
+            if stop.wait(max(began + pause - time.monotonic(), least)):
                 break
             pause = min(2 * pause, self._back_off[1])
         self.state = State.ENDED

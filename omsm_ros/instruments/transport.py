@@ -5,6 +5,7 @@ Constructors open nothing. A lost connection raises ``DeviceError``; ``open`` co
 
 from __future__ import annotations
 
+import math
 import re
 import socket
 import termios
@@ -68,21 +69,39 @@ class Transport(Protocol):
         """Disconnect; does nothing when not connected."""
 
 
-# An answer comes within this and the multiple of the time of the slowest one before [s].
-_QUICK_S, _SEVERAL_TIMES = 0.5, 2.0
+# An answer comes within this and the multiple of the time of the slowest one before. A device may
+# become slower, so each connection without an answer adds the last [s].
+_QUICK_S, _SEVERAL_TIMES, _MORE_S = 0.5, 2.0, 0.25
 
 
 class Patience:
-    """How long to wait for an answer, ``seconds``: as stated, then by the slowest one so far."""
+    """How long to wait for an answer: as stated, then by the slowest one so far.
+
+    A device is set up in its context.
+    """
 
     def __init__(self, stated: float) -> None:
-        self.seconds = self._stated = stated
-        self._slowest = 0.0
+        self._stated = stated
+        self._slowest, self._more = math.inf, 0.0
+
+    @property
+    def seconds(self) -> float:
+        """Return the longest time to wait for an answer [s]."""
+        return min(self._stated, _QUICK_S + _SEVERAL_TIMES * self._slowest + self._more)
 
     def note(self, took: float) -> None:
         """Enter the time that an answer took [s]."""
-        self._slowest = max(self._slowest, took)
-        self.seconds = min(self._stated, _QUICK_S + _SEVERAL_TIMES * self._slowest)
+        self._slowest = took if math.isinf(self._slowest) else max(self._slowest, took)
+
+    def __enter__(self) -> None:
+        """Begin to set the device up."""
+
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        """Wait longer next time if an answer did not come, as usual again if all came."""
+        if error is None:
+            self._more = 0.0
+        elif issubclass(error, DeviceTimeoutError):
+            self._more += _MORE_S
 
 
 # How long a command port waits for more of an answer at a time [s].

@@ -41,13 +41,14 @@ class Bench:
         self.troubles: list[str] = []
         self.connections = 0
         self._connected = False
-        self._pause = BACK_OFF_S[0]
+        self._pause, self._began = BACK_OFF_S[0], 0.0
         self._after = -1  # true number of the last sample checked
 
     def run(self, seconds: float) -> None:
         end = self.loop.clock.now + seconds
         while self.loop.clock.now < end:
             try:
+                self._began = self._began if self._connected else self.loop.clock.now
                 if not self._connected:
                     self.device.open()
                     self.connections += 1
@@ -60,7 +61,8 @@ class Bench:
                 self.troubles.append(str(err))
                 self.blocks += self.device.close()
                 self._connected = False
-                self.loop.wait(self._pause)
+                rest = self._began + self._pause - self.loop.clock.now
+                self.loop.wait(max(rest, BACK_OFF_S[0]))
                 self._pause = min(2 * self._pause, BACK_OFF_S[1])
 
     def end(self) -> None:

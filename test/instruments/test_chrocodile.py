@@ -279,6 +279,18 @@ def test_silence_names_the_baud_rate(cell: Any) -> None:
         run.device.open()
 
 
+def test_a_device_that_became_slower_is_set_up_again(cell: Any) -> None:
+    """Its answers take twice the time that is waited for one after the quick ones before."""
+    run = cell()
+    run.run(0.5)
+    run.instrument.faults.slow_answers = 1.0
+    run.instrument.unplug(0.1)
+    run.run(2.0)
+    assert any("did not answer" in trouble for trouble in run.troubles)
+    run.is_back_within(45.0)
+    run.end()
+
+
 def test_a_line_too_slow_for_the_telegrams_is_named(cell: Any) -> None:
     run = cell()
     run.loop.baud_rate = 115_200

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import threading
@@ -11,8 +12,14 @@ from io import FileIO
 
 import pytest
 
-from omsm_ros.errors import ConfigurationError, DeviceError
-from omsm_ros.instruments.transport import SerialTransport, TcpTransport, Transport, transport_for
+from omsm_ros.errors import ConfigurationError, DeviceError, DeviceTimeoutError
+from omsm_ros.instruments.transport import (
+    Patience,
+    SerialTransport,
+    TcpTransport,
+    Transport,
+    transport_for,
+)
 
 SOON = 5.0
 
@@ -238,3 +245,26 @@ def test_a_tcp_device_that_vanishes_is_noticed(
     )
     assert idle + interval * count <= 15
     assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) <= 15_000
+
+
+# Answers.
+
+
+@pytest.mark.parametrize(("slow", "failures"), [(0.4, 0), (1.2, 3), (1.95, 6)])
+def test_a_device_that_became_slower_is_awaited_longer_at_each_attempt(
+    slow: float, failures: int
+) -> None:
+    """One answer is slow, the others are quick; afterwards all are quick again."""
+    patience, failed = Patience(2.0), 0
+    assert patience.seconds == 2.0
+    for took in (0.01, slow):
+        patience.note(0.01)
+        while took > patience.seconds:
+            with contextlib.suppress(DeviceTimeoutError), patience:
+                patience.note(0.01)
+                raise DeviceTimeoutError("no answer")
+            failed += 1
+    assert failed == failures
+    with patience:
+        patience.note(0.01)
+    assert patience.seconds == pytest.approx(0.52)

@@ -187,6 +187,11 @@ class Chrocodile(StreamDevice):
         """Return the answer to a command; DeviceTimeoutError if none comes. Samples are kept."""
         raise NotImplementedError
 
+    def open(self) -> None:
+        """Connect, or connect again, and set the device up; raises DeviceError."""
+        with self._answers:
+            super().open()
+
     def _prepare(self) -> None:
         wanted, before = self._wanted, self._identity
         self._begin()

@@ -108,7 +108,8 @@ class BlockStreamDevice(StreamDevice):
         self._undescribed = False
         if self._commands is None:
             return
-        with CommandPort(self._commands, self.prompt, self._answers, self._monotonic) as port:
+        port = CommandPort(self._commands, self.prompt, self._answers, self._monotonic)
+        with self._answers, port:
             self._identity = self._set_up(port)
 
     def _decode(self, data: bytes) -> Samples:
