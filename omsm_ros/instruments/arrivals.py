@@ -274,7 +274,7 @@ class MissedTriggerDetector:
         before, since = self._spans()
         for number in _LATEST:
             latest = since[-number - 1 : -1]  # the last one has not ended
-            if len(before) < _MANY_SPANS or len(latest) < number:
+            if len(latest) < number:
                 break
             if (missed := self._missed_between(before, latest)) is not None:
                 latest[:, 1] -= missed * self._period

@@ -129,7 +129,12 @@ class StreamDevice:
         if len(samples):
             self._heard = now
             blocks = self._add(samples, arrival_ns, silent)
-            self._check_counter(now, int(samples["counter"][-1]))
+            if now - self._went_on > UNREADABLE_S:
+                raise NoSamplesError(
+                    f"{self._transport.name} repeats its sample counter "
+                    f"({int(samples['counter'][-1])!r}), so every sample is a duplicate; check "
+                    "that the settings name the place of the counter, and that it counts"
+                )
             return blocks
         if silent <= self._settings.pause:
             return []
@@ -261,15 +266,6 @@ class StreamDevice:
             if b"HTTP" in said or b"SSH" in said:
                 raise unanswered(said) from err
             raise
-
-    def _check_counter(self, now: float, counter: int) -> None:
-        """Raise NoSamplesError if all samples that come are repetitions."""
-        if now - self._went_on > UNREADABLE_S:
-            raise NoSamplesError(
-                f"{self._transport.name} repeats its sample counter ({counter!r}), so every sample "
-                "is a duplicate; check that the settings name the place of the counter, and that "
-                "it counts"
-            )
 
     def _add(self, samples: Samples, arrival_ns: int, silent: float) -> list[BlockPair]:
         self.decoded += len(samples)

@@ -188,7 +188,6 @@ class Chrocodile(StreamDevice):
         raise NotImplementedError
 
     def open(self) -> None:
-        """Connect, or connect again, and set the device up; raises DeviceError."""
         with self._answers:
             super().open()
 
@@ -198,7 +197,13 @@ class Chrocodile(StreamDevice):
         model = self._try("VER").text  # a refusal has no digits
         self._identity = {"model": model if any(map(str.isdigit, model)) else "CHRocodile"}
         intact = self._ever_set_up and self._is_unchanged(before)
-        self._measure_distance()
+        self._try("MMD", 0)
+        self._read("MMD")
+        if self._identity.get("MMD", "0") != "0":
+            raise DeviceError(
+                f"{self._transport.name}: $MMD {self._identity['MMD']} measures thickness by "
+                "interference, and the device refuses $MMD 0; choose the chromatic mode on it"
+            )
         if wanted.head is not None:
             self._set("SEN", wanted.head)
         self._set("SODX", *self._selection)
@@ -247,15 +252,6 @@ class Chrocodile(StreamDevice):
             if found and name in before and f"{found[0]:g}" != before[name].split()[0]:
                 return False
         return True
-
-    def _measure_distance(self) -> None:
-        self._try("MMD", 0)
-        self._read("MMD")
-        if self._identity.get("MMD", "0") != "0":
-            raise DeviceError(
-                f"{self._transport.name}: $MMD {self._identity['MMD']} measures thickness by "
-                "interference, and the device refuses $MMD 0; choose the chromatic mode on it"
-            )
 
     def _read(self, name: str) -> None:
         if name not in self._identity and (found := self._try(name, QUERY).numbers):

@@ -55,17 +55,14 @@ class ChrocodilePacketDevice(Chrocodile):
         self._early.clear()
         self._commands.clear()
         self._said, self._answered = b"", False
-        self._await_configuration()
-        self._try("STO")
-
-    def _await_configuration(self) -> None:
-        """Wait for the configuration, which a device sends to a new client, or request it."""
+        # A device sends its configuration to a new client, or upon request.
         configured = partial(self._await, "CONF", lambda c: c.name == CONFIGURED)
         try:
             configured(self._answers.seconds / 2)
         except DeviceTimeoutError:
             self._transport.write(encode_command(PacketCommand(CONFIGURED, (), 0, 0)))
             configured()
+        self._try("STO")
 
     def _finish(self) -> None:
         self._early.clear()  # measured before the device was set up

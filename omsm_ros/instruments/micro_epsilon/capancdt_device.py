@@ -76,12 +76,8 @@ class CapaNcdtDevice(BlockStreamDevice):
         self._wanted = settings
 
     def _set_up(self, port: CommandPort) -> dict[str, str]:
-        identity = {"model": port.ask("$VER", "\r", rb"\$VER").strip()}
-        self._set_sample_time(port)
-        return identity
-
-    def _set_sample_time(self, port: CommandPort) -> None:
         """Set the sample time; the controller rounds it and reports the result."""
+        identity = {"model": port.ask("$VER", "\r", rb"\$VER").strip()}
         wanted = self._wanted.sample_period / MICROSECOND_S
         said = port.ask(f"$STI{wanted:.0f}", "\r", rb"\$STI")
         found = re.search(r"\$STI\d+,(\d+)\s*OK", said)
@@ -96,6 +92,7 @@ class CapaNcdtDevice(BlockStreamDevice):
                 f"every {found[1]} µs; set sample_period to {float(found[1]) * MICROSECOND_S:.9g} s"
             )
         port.ask(f"$TRG{int(self._wanted.triggered)}", "\r", rb"\$TRG")
+        return identity
 
     def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
         return channel_dtype(kind[0])

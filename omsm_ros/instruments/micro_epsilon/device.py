@@ -264,8 +264,15 @@ class ConfocalDtDevice(StreamDevice):
         self._unread = 0 if len(values) else self._unread + len(data)
         columns = dict(zip(self._wanted.values, values.T, strict=True))
         samples = np.zeros(len(values), SAMPLE)
-        self._check_order(columns["distance"])
-        raw, samples["status"] = distance_of(columns["distance"], self._wanted.probe.full_scale)
+        distance = columns["distance"]
+        if len(distance) >= _MANY_VALUES and np.all(distance <= INTENSITY_FULL):
+            self._decoder.reset()
+            raise NoSamplesError(
+                f"{self._transport.name}: the values taken for distance are at most "
+                f"{int(distance.max())}, far before the range, as an intensity is; check the order "
+                "of `signals`"
+            )
+        raw, samples["status"] = distance_of(distance, self._wanted.probe.full_scale)
         samples["distance"] = self._wanted.probe.distance(raw)
         samples["intensity"] = intensity_of(columns.get("intensity"))
         if "counter" in columns:
@@ -274,16 +281,6 @@ class ConfocalDtDevice(StreamDevice):
             samples["counter"] = self._counted + np.cumsum(1 + spoilt) - 1
             self._counted = int(samples["counter"][-1]) + 1
         return samples
-
-    def _check_order(self, distance: IntArray) -> None:
-        """Raise NoSamplesError if the values of the distance look like intensities."""
-        if len(distance) >= _MANY_VALUES and np.all(distance <= INTENSITY_FULL):
-            self._decoder.reset()
-            raise NoSamplesError(
-                f"{self._transport.name}: the values taken for distance are at most "
-                f"{int(distance.max())}, far before the range, as an intensity is; check the order "
-                "of `signals`"
-            )
 
     def _listen_in(self, silent: float) -> None:
         if "counter" not in self._wanted.values:
@@ -322,12 +319,8 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
     @property
     def settings(self) -> dict[str, object]:
         """Return the controller's identity and rate, if there is a command port."""
-        reported = self._identity
-        return {
-            name: reported[name]
-            for name in ("name", "article", "serial", "rate")
-            if name in reported
-        }
+        kept = ("name", "article", "serial", "rate")
+        return {name: self._identity[name] for name in kept if name in self._identity}
 
     def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
         return confocal_dtype(kind)
@@ -335,10 +328,6 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
     def _set_up(self, port: CommandPort) -> dict[str, str]:
         pairs = re.findall(r"(\w[\w ]*):([^\r\n]+)", port.ask("GETINFO", "\n", _INFORMATION))
         identity = {key.strip().lower(): value.strip() for key, value in pairs}
-        self._set_rate(port)
-        return identity | {"rate": f"{1 / self._wanted.sample_period:g}"}  # as read back
-
-    def _set_rate(self, port: CommandPort) -> None:
         wanted = 1 / (self._wanted.sample_period * _KILOHERTZ)
         said = port.ask(f"MEASRATE {wanted:.4g}", "\n")
         if error := re.search(r"E\d\d[^\r\n]*", said):
@@ -359,6 +348,7 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
                 f"{self._transport.name}: {wanted:.4g} kHz was requested, the controller measures "
                 f"at {answered[-1]:g} kHz; set sample_period to {1e-3 / answered[-1]:.9g} s"
             )
+        return identity | {"rate": f"{1 / self._wanted.sample_period:g}"}  # as read back
 
     def _samples_of(self, frames: Frames, counter: IntArray) -> Samples:
         names = frames.dtype.names or ()
@@ -375,7 +365,12 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         )
         samples["intensity"] = intensity_of(light)
         for number, axis in enumerate(self._wanted.wired, start=1):
-            samples["counts"][:, axis] = self._encoder(frames, number)
+            if f"encoder {number}" not in names:
+                raise DeviceError(
+                    f"{self._transport.name} sends no encoder {number}; select it "
+                    "(OUTADD_ETH … ENC1 ENC2 ENC3) or take the axis from `encoders`"
+                )
+            samples["counts"][:, axis] = frames[f"encoder {number}"]
         return samples
 
     def _peak(self, frames: Frames) -> tuple[IntArray, IntArray | None]:
@@ -388,15 +383,6 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
             self._intensity_leads = answered
         first, second = words.T
         return (second, first) if self._intensity_leads else (first, second)
-
-    def _encoder(self, frames: Frames, number: int) -> IntArray:
-        if f"encoder {number}" not in (frames.dtype.names or ()):
-            raise DeviceError(
-                f"{self._transport.name} sends no encoder {number}; select it "
-                "(OUTADD_ETH … ENC1 ENC2 ENC3) or take the axis from `encoders`"
-            )
-        counts: IntArray = frames[f"encoder {number}"].astype(np.int64)
-        return counts
 
 
 def _check_not_silent(name: str, period: float, patience: float, silent: float) -> None:
