@@ -13,8 +13,7 @@ from omsm_ros.instruments.blocks import BlockPair
 
 # Requests of other threads wait for a read to end, so it is short [s].
 _READ_S = 0.05
-# The time from one connection to the next doubles from the first, which is the least pause between
-# them, to the second [s].
+# From one connection to the next: it doubles from the first, the least pause, to the second [s].
 BACK_OFF_S = (0.25, 1.0)
 
 

@@ -188,6 +188,7 @@ class Chrocodile(StreamDevice):
         raise NotImplementedError
 
     def open(self) -> None:
+        """Connect, or connect again, and set the device up; raises DeviceError."""
         with self._answers:
             super().open()
 
