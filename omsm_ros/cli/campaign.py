@@ -4,6 +4,7 @@ import argparse
 import hashlib
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -41,6 +42,8 @@ _SCHEMA = "omsm-campaign/1"
 _MAX_STATE_BYTES = 50_000_000
 # A process that the system killed for lack of memory may succeed once others have ended.
 _ATTEMPTS = 2
+# A scheduler answers within this time [s].
+_ANSWER_S = 10.0
 _LOCAL_HOSTS = ("127.0.0.1", "::1", "localhost")
 
 _ENTRY = group(
@@ -277,11 +280,15 @@ def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
             "be tls://host:port, with the certificates in Dask's own configuration"
         )
     try:
+        if local:
+            # Dask itself waits without end for the greeting of a scheduler.
+            with socket.create_connection((address.hostname, address.port), _ANSWER_S) as link:
+                link.recv(1)
         from distributed import Client
+
+        client = Client(scheduler, timeout=_ANSWER_S)
     except ImportError as err:
         raise ConfigurationError("--scheduler needs Dask: pip install distributed") from err
-    try:
-        client = Client(scheduler, timeout=10)
     except (OSError, ValueError, TypeError) as err:
         raise ConfigurationError(
             f"no scheduler answers at {scheduler!r}: {exception_text(err)}; start one there with "

@@ -334,6 +334,9 @@ def _report_internal_error(err: Exception) -> int:
     if short := too_many_open_files(err):
         warn(short)
         return BAD_INPUT
+    if isinstance(err, FileNotFoundError) and err.filename is None:  # of os.getcwd
+        _warn("the folder in which this command runs was deleted; change to one that exists")
+        return BAD_INPUT
     if isinstance(err, OSError) and (err.filename is not None or err.errno in _DISK_ERRORS):
         # The system refuses a path: a name too long, no permission, a broken disk.
         path = "a file" if err.filename is None else shown(os.fsdecode(err.filename))

@@ -2,12 +2,13 @@
 
 import json
 import math
+import socket
 
 import numpy as np
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.cli import command_line, doctor, start
+from omsm_ros.cli import campaign, command_line, doctor, start
 
 
 def run(capsys, *words):
@@ -228,4 +229,19 @@ def test_a_scheduler_has_an_address_of_dask(capsys, tmp_path, calibration, addre
     status, _, err = run(capsys, *words, "--scheduler", address)
     assert status == 2
     assert address in err
+    assert err.count("\n") == 1
+
+
+def test_a_scheduler_that_accepts_and_says_nothing_is_named(
+    capsys, monkeypatch, tmp_path, calibration
+):
+    (tmp_path / "bags").mkdir()
+    (tmp_path / "bags" / "a.mcap").write_bytes(b"")
+    monkeypatch.setattr(campaign, "_ANSWER_S", 0.1)
+    words = ("batch", tmp_path / "bags", "--calibration", calibration, "--out", tmp_path / "out")
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        status, _, err = run(capsys, *words, "--scheduler", address)
+    assert status == 2
+    assert f"no scheduler answers at '{address}': timed out; start one there" in err
     assert err.count("\n") == 1

@@ -37,6 +37,26 @@ def test_doctor_ends_with_a_refusal_where_something_must_be_mended(capsys, monke
 
 
 @pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("doctor", "the folder in which this command runs was deleted"),
+        ("plan steps --out p", "cannot write 'p/steps.csv'"),
+        ("identify a.mcap --out c.json", "no bag at 'a.mcap'"),
+    ],
+)
+def test_a_deleted_working_folder_is_one_line_of_error(capsys, monkeypatch, tmp_path, words, said):
+    monkeypatch.setattr(doctor, "examine_host", lambda folder, port: [doctor._disk(folder)])
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert cli.main(words.split()) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"omsm: {said}")
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
     ("option", "says"),
     [("--radius=2", "that of the twin's mirror"), ("--feed=1e-7", "40 000 000 samples")],
 )

@@ -133,9 +133,10 @@ def content_frequency(z: FloatArray, sample_period: float) -> float:
     """Return the frequency [Hz] below which 99.9 % of the mean square velocity lies.
 
     It is 0 at standstill. The white noise of the encoder is estimated in the upper half of the
-    band and subtracted. A slow change of the velocity from end to end would be a jump of the
-    periodic continuation with all frequencies in it, so a cubic is subtracted. For whole turns,
-    which have no such jump, a cubic would make one. The lower frequency of both ways is returned.
+    band and subtracted; what does not exceed its scatter is not counted. A slow change of the
+    velocity from end to end would be a jump of the periodic continuation with all frequencies in
+    it, so a cubic is subtracted. For whole turns, which have no such jump, a cubic would make one.
+    The lower frequency of both ways is returned.
     """
     velocity = np.diff(z)
     if len(velocity) > _LONG:
@@ -155,14 +156,17 @@ def _content_without(slow: FloatArray, velocity: FloatArray, sample_period: floa
     upper = slice(len(power) // 2, None)
     # The power of a noise line is exponentially distributed, with a median of ln 2 of the mean.
     noise = float(np.median(power[upper] / shape[upper])) / np.log(2) * shape
-    moved = power - noise
-    # A motion exceeds five standard deviations of the sum of the noise.
-    if np.sum(moved) <= 5 * float(np.linalg.norm(noise)):
-        return 0.0
+    # Sums over each line and all above; the last is over none.
+    moved, mean, square = (
+        np.cumsum(np.append(line, 0.0)[::-1])[::-1] for line in (power - noise, noise, noise**2)
+    )
+    # Of the noise in them: its scatter, and the uncertainty of its level, which is a median.
+    deviation = np.sqrt(square + (mean / np.log(2)) ** 2 / (len(power) / 2))
     # `moved` has the positive frequencies only, half of Parseval's sum.
     slowly = float(np.sum((slow - np.mean(slow)) ** 2)) * len(velocity) / 2
-    gathered = slowly + np.cumsum(moved)
-    place = int(np.argmax(gathered >= _CONTENT_SHARE * gathered[-1]))
+    # A motion exceeds five standard deviations.
+    least = np.maximum((1 - _CONTENT_SHARE) * (slowly + moved[0]), 5 * deviation)
+    place = max(int(np.argmax(moved <= least)) - 1, 0)
     return float(place / (len(velocity) * sample_period))
 
 

@@ -57,6 +57,16 @@ def test_noise_of_the_encoder_is_no_content() -> None:
     assert content_frequency(1e-3 * SINE + noise, PERIOD) < 20.0
 
 
+@pytest.mark.parametrize("lost", [0, 1, 2500])
+def test_noise_of_the_encoder_is_no_content_of_a_small_motion_whatever_its_length(lost) -> None:
+    """The noise holds more of the mean square velocity than the motion of 1.3 Hz."""
+    time = np.arange(60_000 - lost) * PERIOD
+    small = 1e-6 * np.sin(2 * np.pi * 1.3 * time)
+    for seed in range(10):
+        noise = np.random.default_rng(seed).normal(0, 5e-9, len(time))
+        assert content_frequency(small + noise, PERIOD) == pytest.approx(1.3, abs=0.1)
+
+
 @pytest.mark.parametrize("noise", [0.0, 1e-9])
 def test_the_feed_over_a_round_part_holds_no_frequency_and_its_swing_does(noise):
     time = np.arange(0, 60, PERIOD)
