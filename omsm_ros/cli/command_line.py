@@ -335,7 +335,7 @@ def _report_internal_error(err: Exception) -> int:
         warn(short)
         return BAD_INPUT
     if isinstance(err, FileNotFoundError) and err.filename is None:  # of os.getcwd
-        _warn("the folder in which this command runs was deleted; change to one that exists")
+        warn("the folder in which this command runs was deleted; change to one that exists")
         return BAD_INPUT
     if isinstance(err, OSError) and (err.filename is not None or err.errno in _DISK_ERRORS):
         # The system refuses a path: a name too long, no permission, a broken disk.

@@ -79,7 +79,8 @@ def in_child(
         child.start()
     sender.close()
     until = time.monotonic() + seconds
-    kind, content = _PROGRESS, cast("Any", {})
+    # What it does first, which includes loading modules.
+    kind, content = _PROGRESS, cast("Any", {"stage": "reading"})
     try:
         while kind == _PROGRESS:
             if attend is not None:

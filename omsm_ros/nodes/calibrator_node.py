@@ -276,7 +276,6 @@ def _identify_bag(
     options: dict[str, Any],
     progress: Callable[..., None] = silent,
 ) -> Identification:
-    progress("reading")
     # Loaded on demand, because reading bags takes long to import.
     from omsm_ros.pipelines.recording import Recording
 

@@ -52,6 +52,7 @@ _LAST_LOOKS = 20
 _DELAYED_MS = 1000.0
 # Reasons that mean a loss of data, unlike a probe without a target.
 _LOSSES = ("unmatched", "late", "overdue", "jumped")
+_FLOW = ("received", "refused", "corrected", "invalid")
 
 
 def verdict_values(verdict: Mapping[str, Any]) -> dict[str, object]:
@@ -152,21 +153,24 @@ class CorrectionState:
             report.values[f"missing_{stream}"] = watched[f"{stream} missing"] = missing
             for name, value in (counts | counted).items():
                 report.values[f"{stream}_{name}"] = value
-                if name in _LOSSES:
+                if name in (*_LOSSES, *_FLOW):
                     watched[f"{stream} {name}"] = value
             watched[f"{stream} refused"] = self.refused[stream]
-            watched[f"{stream} received"] = counts["received"]
         return watched
 
     def _add_losses(self, report: StateReport, watched: dict[str, float], now: float) -> None:
         rises = self._recent.update(watched, now)
         for stream in _STREAMS:
-            received = rises.pop(f"{stream} received", 0)
-            refused = rises.pop(f"{stream} refused", 0)
+            received, refused, corrected, invalid = (
+                rises.pop(f"{stream} {name}", 0) for name in _FLOW
+            )
             if refused and not received:
                 report.add(ERROR, f"every block of {stream} is refused: {self.refusal}")
             elif refused:
                 report.add(WARN, f"just now: {refused:.0f} samples of {stream} refused")
+        if invalid and not corrected:  # alike in both streams
+            why = "the probe sees no surface, or an axis is lost"
+            report.add(WARN, f"nothing to correct: {invalid:.0f} samples invalid just now: {why}")
         if rises:
             text = ", ".join(f"{name} {rise:.0f}" for name, rise in rises.items())
             report.add(WARN, f"just now: {text}")

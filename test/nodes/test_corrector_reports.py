@@ -167,6 +167,21 @@ def test_missing_samples_are_reported_with_their_number():
     assert report.values["missing_axes"] == 500
 
 
+@pytest.mark.parametrize("stream", ["axes", "distance"])
+def test_a_stream_without_a_valid_sample_is_a_warning_with_its_reason(stream):
+    corrector, state = Corrector(CALIBRATION, CorrectionOptions()), CorrectionState()
+    for first in range(0, 2000, BLOCK):
+        axes, distance = blocks(first)
+        (axes.z if stream == "axes" else distance.distance)[:] = np.nan
+        corrector.push_axes(axes)
+        corrector.push_distance(distance)
+        heard(state, first, first * PERIOD)
+    report = state.report(corrector, 2.0, 0.0)
+    assert report.level == WARN
+    invalid = report.values["distance_invalid"]
+    assert f"nothing to correct: {invalid} samples invalid just now: the probe" in report.text
+
+
 def test_the_oldest_of_what_was_taken_tells_how_late_it_was():
     corrector, state, now = corrected()
     for arrived in (5_000_000_000, 3_000_000_000, 6_000_000_000):

@@ -1,6 +1,8 @@
 """The corrector alone, live: what it refuses, what it says of what it was forced to use, where
 its points lie, and what it predicts."""
 
+import os
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -126,7 +128,29 @@ def test_an_overridden_calibration_marks_every_cloud_by_its_frame(cell, true_cal
     )
     assert answer.success, answer.message
     assert feed.answer(*blocks(first=10_000)).header.frame_id == "workpiece"
+    # Counts survive a new calibration.
+    value = cell.operator.value
+    cell.wait("the counts", lambda: value("corrector", "axes_received") == 3 * COUNT)
+    assert value("corrector", "clouds_published") == 3
     cell.wait("no warning", lambda: cell.operator.text("corrector", "message") == "correcting")
+
+
+def test_what_waits_at_the_end_is_corrected_and_named(cell, true_calibration):
+    """The node is asked to end while it stands still and blocks come."""
+    cell.processes.start("corrector", calibration=saved(cell, "cal.json", true_calibration))
+    feed = Feed(cell)
+    feed.answer(*blocks())
+    pid = cell.processes.pid("corrector")
+    os.kill(pid, signal.SIGSTOP)
+    for number in range(1, 11):
+        feed.send(*blocks(first=number * COUNT))
+    os.kill(pid, signal.SIGINT)
+    os.kill(pid, signal.SIGCONT)
+    cell.processes.end("corrector")
+    said = (cell.folder / "log" / "corrector.log").read_text()
+    last = said[said.rindex("samples so far: ") :]
+    assert last.count(f"'received': {11 * COUNT}") == 2, last
+    cell.wait("the last points", lambda: sum(c.width for c in feed.clouds) > 10 * COUNT)
 
 
 def test_geometry_parameters_place_the_points(cell, true_calibration):

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from omsm_ros.core.streams.blocks import DistanceBlock
 from omsm_ros.core.streams.motion_record import BlockBuffer
@@ -52,6 +53,16 @@ def test_a_block_that_comes_late_or_again_ends_no_motion():
     assert firsts(buffer) == [0, 100, 300, 100, 200, 400]
     assert buffer.forgotten == 0
     assert firsts(buffer, 0.05) == [400]
+
+
+@pytest.mark.parametrize("stamp_s", [-86_400.0, 0.0, 0.5, 60.0])
+def test_one_late_block_wipes_nothing_whatever_its_stamp(stamp_s):
+    buffer = BlockBuffer(10_000)
+    for first in (300, 400, 0, 500, 600):
+        stamp = stamp_s if first == 0 else first * 1e-3
+        buffer.add(block(first, stamp_ns=round(stamp * 1e9)))
+    assert {300, 400, 500, 600} <= set(firsts(buffer))
+    assert len(buffer) + buffer.forgotten == 500
 
 
 def test_a_motion_that_begins_soon_after_is_a_new_one():
