@@ -331,19 +331,15 @@ def _make_writable() -> None:
 
 def _report_internal_error(err: Exception) -> int:
     """Print an unexpected error; return the exit status."""
-    if short := too_many_open_files(err):
-        warn(short)
-        return BAD_INPUT
+    known = too_many_open_files(err)
     if isinstance(err, FileNotFoundError) and err.filename is None:  # of os.getcwd
-        warn("the folder in which this command runs was deleted; change to one that exists")
-        return BAD_INPUT
-    if isinstance(err, OSError) and (err.filename is not None or err.errno in _DISK_ERRORS):
+        known = "the folder in which this command runs was deleted; change to one that exists"
+    elif isinstance(err, OSError) and (err.filename is not None or err.errno in _DISK_ERRORS):
         # The system refuses a path: a name too long, no permission, a broken disk.
         path = "a file" if err.filename is None else shown(os.fsdecode(err.filename))
-        warn(f"{path}: {err.strerror}; check the path, its permissions and the disk")
-        return BAD_INPUT
-    warn(defect(err))
-    return DEFECT
+        known = known or f"{path}: {err.strerror}; check the path, its permissions and the disk"
+    warn(known or defect(err))
+    return BAD_INPUT if known else DEFECT
 
 
 def _check_words(given: list[str]) -> None:

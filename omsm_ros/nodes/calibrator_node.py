@@ -152,7 +152,9 @@ class CalibratorNode(ManagedNode):
     async def _on_identify(self, request: Any, response: Any, goal: Goal | None = None) -> None:
         """Answer the service, or the action with its ``goal``."""
         try:
-            bag = self._bag(request.bag)
+            bag, folders = None, self.values["bag_folders"]
+            if request.bag:
+                bag = resolved_within(Path(request.bag), folders, BagError, "bag")
             identified = await self._worker.do(self._work(request, bag, goal), goal)
             if goal is not None:
                 goal.attend()  # nothing is put in force for a goal that was cancelled
@@ -185,11 +187,6 @@ class CalibratorNode(ManagedNode):
         kept = self._keep_file(calibration, since_ns)
         self._topic.announce(calibration, since_ns)
         return True, f"{verdict_text(calibration)}; {calibration.id[:12]} {kept}"
-
-    def _bag(self, given: str) -> Path | None:
-        if not given:
-            return None
-        return resolved_within(Path(given), self.values["bag_folders"], BagError, "bag")
 
     def _noted(self, bag: Path | None, calibration: Calibration) -> str:
         """Add it to the catalogue and return a note; an error of the database is only a note."""

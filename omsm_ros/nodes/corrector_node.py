@@ -1,7 +1,7 @@
 """``corrector``: computes corrected surface points from axes and distance, continuously."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -55,22 +55,13 @@ _LOSSES = ("unmatched", "late", "overdue", "jumped")
 _FLOW = ("received", "refused", "corrected", "invalid")
 
 
-def verdict_values(verdict: Mapping[str, Any]) -> dict[str, object]:
-    """Return the verdict as values of a report; it does not change the level of the node."""
-    return {
-        "verdict": verdict["code"],
-        "verdict_text": verdict["text"],
-        "verdict_next": "; ".join(next_steps(verdict)),
-        "verdict_uncertainty_m": verdict["uncertainty"],
-    }
-
-
 class CorrectionState:
     """Counts samples that are not corrected, and reports on all of them."""
 
     def __init__(self) -> None:
         self.uncalibrated = dict.fromkeys(_STREAMS, 0)
         self.refused = dict.fromkeys(_STREAMS, 0)
+        self.outside = {"uncalibrated": self.uncalibrated, "refused": self.refused}
         self.refusal = ""
         self.published = 0
         self.load = LoadMeter()
@@ -120,7 +111,7 @@ class CorrectionState:
         motion: estimate of the offset of two devices' counters
         """
         report = StateReport("correcting", {"clouds_published": self.published})
-        for name, counts in (("uncalibrated", self.uncalibrated), ("refused", self.refused)):
+        for name, counts in self.outside.items():
             report.values |= {f"{stream}_{name}": counts[stream] for stream in _STREAMS}
         report.values |= {f"begins_at_{name}": first for name, first in self.begins_at.items()}
         self._add_starved(report, now)
@@ -348,10 +339,8 @@ class CorrectorNode(ManagedNode):
             bag = str(resolved_within(Path(bag), self.values["bag_folders"], BagError, "bag"))
         known, period = self._topic.calibration, request.sample_period
         predict = partial(_prediction, known, bag, request.z, period)
-        if goal is not None:
-            predict = partial(in_child, predict, attend=goal.attend)
-        elif bag:
-            predict = partial(in_child, predict)
+        if goal is not None or bag:
+            predict = partial(in_child, predict, attend=goal.attend if goal else None)
         prediction = await self._worker.do(predict, goal)
         response.peak_to_valley = prediction.peak_to_valley
         response.rms = prediction.rms
@@ -426,20 +415,28 @@ class CorrectorNode(ManagedNode):
         if self._motion and self._corrector and not self._corrector.slips.same_stamps:
             self._motion.judge()
         now, cpu = time.monotonic(), time.process_time()
+        now_ns = self.get_clock().now().nanoseconds
         report = self._state.report(self._corrector, now, cpu, self._motion)
         report.values["calibration"] = self._in_force_id()
         # Without a point there is nothing to assess.
         if self._state.published and self._corrector and self._topic.calibration is not None:
-            verdict = live_verdict(
-                self._corrector, self._topic.calibration, self._sources, accuracy_of(self.values)
-            )
-            report.values |= verdict_values(verdict)
-            used, now_ns = self._in_force_id(), self.get_clock().now().nanoseconds
-            steps, accuracy = next_steps(verdict), accuracy_of(self.values)
+            used, accuracy = self._topic.calibration, accuracy_of(self.values)
+            verdict = live_verdict(self._corrector, used, self._sources, accuracy)
+            steps = next_steps(verdict)
+            # They do not change the level of the node.
+            report.values |= {
+                "verdict": verdict["code"],
+                "verdict_text": verdict["text"],
+                "verdict_next": "; ".join(steps),
+                "verdict_uncertainty_m": verdict["uncertainty"],
+            }
             self._verdicts.publish(
-                verdict_message(self._messages, verdict, steps, used, accuracy, now_ns)
+                verdict_message(self._messages, verdict, steps, used.id, accuracy, now_ns)
             )
-        self._publish_account()
+        counts, outside = self._state.account(self._corrector), self._state.outside
+        self._accounts.publish(
+            account_message(self._messages, counts, outside, self._state.published, now_ns)
+        )
         report.values["points_subscribers"] = self._points.get_subscription_count()
         report.values["requests_waiting"] = self._worker.waiting
         if self._frame != self.values["workpiece_frame"]:
@@ -451,14 +448,6 @@ class CorrectorNode(ManagedNode):
         if self._topic.refused:
             report.add(WARN, f"a calibration was refused: {self._topic.refused}")
         return report
-
-    def _publish_account(self) -> None:
-        state = self._state
-        outside = {"uncalibrated": state.uncalibrated, "refused": state.refused}
-        account, now_ns = state.account(self._corrector), self.get_clock().now().nanoseconds
-        self._accounts.publish(
-            account_message(self._messages, account, outside, state.published, now_ns)
-        )
 
 
 def _prediction(*motion: Any) -> Prediction:

@@ -152,12 +152,11 @@ def predict_from(
 ) -> Prediction:
     """Predict the dynamic error of the motion in ``bag``, or of ``z`` [m] if that is empty.
 
-    progress: called with "reading" and "predicting"
+    progress: called with "predicting" once the motion is read
     """
     if calibration is None:
         raise CalibrationError("no calibration in use; call identify or load one")
     if bag:
-        progress("reading")
         with Recording(bag) as recording:
             path = recording.scan_path()
     else:

@@ -7,8 +7,8 @@ import pytest
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.errors import FileError
 from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, sources_of
-from omsm_ros.nodes.corrector_node import verdict_values
 from omsm_ros.pipelines.measure import live_verdict, with_sources
+from omsm_ros.report.verdict import next_steps
 
 DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
 FILE = """\
@@ -48,7 +48,7 @@ def test_the_verdict_follows_what_is_corrected(tmp_path, true_calibration, small
     after = live_verdict(corrector, true_calibration, stated, accuracy_of(reported))
     # A walk of 1 nm in a second is one of 6 nm in forty, and half of that on the mean.
     assert 5e-9 < after["uncertainty"] / 2 < 0.1e-6
-    shown = verdict_values(after)
-    assert shown["verdict"] != "verified"
-    assert "larger than the accuracy of 1.0 nm asked for" in shown["verdict_next"]
-    assert "scan the part again at twice the speed" in shown["verdict_next"]
+    assert after["code"] != "verified"
+    steps = "; ".join(next_steps(after))
+    assert "larger than the accuracy of 1.0 nm asked for" in steps
+    assert "scan the part again at twice the speed" in steps
