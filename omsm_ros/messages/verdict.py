@@ -27,7 +27,8 @@ verdict.wrong_sense: the scans agree only if C counts the other way, or the part
 verdict.not_redundant: one speed and direction cannot show an error of the dynamics, a lag or a
     drift
 verdict.not_evaluated: not evaluated, and not shown by these scans: {names} (may change the heights
-    by {value:m/2}); {remedy}, or declare it with its evaluation
+    by {value:m/2}); {remedy}{declare}
+verdict.declare: , or declare {names} with its evaluation
 verdict.declared_only: declared without an evaluation, and not shown by these scans: {names} (may
     change the heights by {value:m/2}); {remedy}, or evaluate it from a recording
 verdict.looks_like: the form ({value:m/2} rms of it) looks like {names}, which these scans cannot

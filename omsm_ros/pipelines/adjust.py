@@ -26,7 +26,12 @@ from omsm_ros.core.adjustment.adjust import corrected_heights
 from omsm_ros.core.adjustment.figures import Contribution
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions
-from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources, StatedSource
+from omsm_ros.core.correction.machine_sources import (
+    NAMES,
+    NOTHING_STATED,
+    MachineSources,
+    StatedSource,
+)
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.systematic import EVALUATED
 from omsm_ros.core.form.deviation_map import Doubt, UncertainValue, conformity
@@ -125,6 +130,8 @@ def on_one_clock(scans: Sequence[AdjustedScan]) -> list[AdjustedScan]:
 
 # Declared names that the adjustment calls otherwise.
 _RENAMED = {"probe_noise": "noise"}
+# Names of those files for families that are declared by another name.
+_DECLARED_AS = {"noise": "probe_noise", "probe_square": "probe_linearity"}
 # Declared sources that no scan adjusts: those of single readings.
 NOT_ADJUSTED = ("probe_resolution", "encoder_noise", "encoder_resolution", "discretisation")
 
@@ -165,7 +172,7 @@ def _prior(source: StatedSource, abbe_arm: float) -> Source:
         size *= arm
     parameters = source.parameters
     return Source(name, size, parameters.get("correlation_length"), source.how == EVALUATED,
-                  parameters.get("period"))  # fmt: skip
+                  parameters.get("period"), parameters.get("half_range"))  # fmt: skip
 
 
 def adjust_bags(
@@ -427,11 +434,25 @@ def _values(reason: Reason) -> Mapping[str, Any]:
     names, remedy = reason.names, ""
     if reason.code in _OPEN:
         names, remedy = names[:-1], sentence(f"verdict.add_{names[-1]}", {})
-    # With the name that a file of sources and --accept know.
-    texts = [str(int(n) + 1) if scans else f"{source_name(n)} ({n})" for n in names]
+    # With the name that --accept knows, or that of a file of sources where one may be declared.
+    files = reason.code in ("not_evaluated", "declared_only")
+    known = [_in_file(n) if files else n for n in names]
+    texts = [
+        str(int(n) + 1) if scans else source_name(n) + (f" ({name})" if name else "")
+        for n, name in zip(names, known, strict=True)
+    ]
     joined = (", " if reason.code in _OPEN else " or ").join(texts)
+    possible = ", ".join(dict.fromkeys(filter(None, known)))
+    declare = sentence("verdict.declare", {"names": possible}) if possible else ""
     return {"names": joined, "value": reason.value, "limit": reason.limit, "remedy": remedy,
-            "contribution": _contribution_text(reason.largest)}  # fmt: skip
+            "declare": declare, "contribution": _contribution_text(reason.largest)}  # fmt: skip
+
+
+def _in_file(family: str) -> str:
+    """Return the name by which a file of sources declares ``family``, "" if it does not."""
+    name = family.split("@")[0].split("/")[0]
+    name = _DECLARED_AS.get(name, name)
+    return name if name in NAMES else ""
 
 
 def _contribution_text(largest: Contribution | None) -> str:

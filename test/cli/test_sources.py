@@ -10,10 +10,12 @@ from soaked import soaked
 from omsm_ros import cli
 from omsm_ros.core.adjustment.scan_data import ScanData
 from omsm_ros.core.adjustment.source_evaluation import KINDS, evaluate_sources
+from omsm_ros.core.adjustment.verdict import Reason, Verdict
+from omsm_ros.core.correction.machine_sources import NAMES, OF_CALIBRATION
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import DataError
 from omsm_ros.io.descriptions import load_sources
-from omsm_ros.pipelines.adjust import priors_of
+from omsm_ros.pipelines.adjust import priors_of, verdict_entry
 
 from .written import facts
 
@@ -120,7 +122,21 @@ def test_a_stated_linearity_counts_for_the_square_of_the_distance_too(tmp_path):
         "half_range: 5.0e-5, how: evaluated, reason: five stand-offs}\n", encoding="utf-8",
     )  # fmt: skip
     priors = priors_of(load_sources(tmp_path / "sources.yaml"))
-    assert {(p.name, p.uncertainty, p.evaluated) for p in priors} == {
-        ("probe_linearity", 3e-9, True),
-        ("probe_square", 3e-9, True),
+    assert {(p.name, p.uncertainty, p.evaluated, p.half_range) for p in priors} == {
+        ("probe_linearity", 3e-9, True, 5e-5),
+        ("probe_square", 3e-9, True, 5e-5),
     }
+
+
+@pytest.mark.parametrize(
+    ("family", "declared"),
+    [("creep", None), ("probe_square", "probe_linearity"), ("spindle_axial/3", "spindle_axial"),
+     ("centre_x", "centre_x"), ("lag_x", None)],
+)  # fmt: skip
+def test_only_what_a_file_of_sources_accepts_is_to_be_declared(family, declared):
+    reason = Reason("not_evaluated", (family, "other_speed"), 3e-8, 2e-8)
+    (said,) = verdict_entry(Verdict("not_verified", (reason,)))["reasons"]
+    assert said["names"][0] == family
+    assert (f"or declare {declared} with" in said["text"]) == (declared is not None)
+    assert ("declare" in said["text"]) == (declared is not None)
+    assert declared in (None, *(set(NAMES) - set(OF_CALIBRATION)))

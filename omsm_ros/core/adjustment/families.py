@@ -32,7 +32,7 @@ class Ranges:
     motion, distance, radius: half ranges [m]
     slide, lift: least and greatest slide x and motion [m];  clampings: number of each scan's
     durations, feeds: of each scan [s], of slide x [m/s]
-    lengths, periods: declared, by family [m]
+    lengths, periods, half_ranges: declared, by family [m]
     """
 
     speed: float
@@ -48,6 +48,7 @@ class Ranges:
     feeds: tuple[float, ...]
     lengths: Mapping[str, float] = field(default_factory=dict)
     periods: Mapping[str, float] = field(default_factory=dict)
+    half_ranges: Mapping[str, float] = field(default_factory=dict)
 
 
 # A probe that is driven through less of its range shows no error of it: the plausible size of its
@@ -82,6 +83,7 @@ def ranges_of(
         feeds=tuple(float((v.slide_x[-1] - v.slide_x[0]) / (v.since[-1] or 1.0)) for v in views),
         lengths={p.name: p.correlation_length for p in priors if p.correlation_length is not None},
         periods={p.name: p.period for p in priors if p.period is not None},
+        half_ranges={p.name: p.half_range for p in priors if p.half_range is not None},
     )
 
 
@@ -273,14 +275,20 @@ def _of_the_probe(r: Ranges) -> list[Family]:
         _one("probe_slope_moving", "m", lambda v: np.hypot(v.slope_x, v.slope_y)
              * np.abs(v.motion_rate) / fast, 1e-7, OTHER_SPEED),
         _one("static_gain", "1", lambda v: -v.distance, 1e-2, OTHER_STAND_OFF),
-        _one("probe_square", "m", lambda v: (v.distance / r.distance) ** 2, 1e-7, OTHER_STAND_OFF),
-        _one("probe_linearity", "m", lambda v: (v.distance / r.distance) ** 3, 1e-7,
-             OTHER_STAND_OFF),
+        _of_distance("probe_square", 2, r),
+        _of_distance("probe_linearity", 3, r),
         _one("probe_slope_square", "m/rad", lambda v: v.slope_x**2 + v.slope_y**2, 1e-5,
              REFERENCE),
         Family("beam", "1", 2, lambda v: np.stack(
             [v.across(v.distance, 0.0), v.across(0.0, v.distance)]), 1e-2, OTHER_STAND_OFF),
     ]  # fmt: skip
+
+
+def _of_distance(name: str, power: int, r: Ranges) -> Family:
+    """Return a power of the distance, one at the declared half range, else at the range in use."""
+    end = r.half_ranges.get(name, r.distance)
+    return _one(name, "m", lambda v: (v.distance / end) ** power,
+                1e-7 * (end / r.distance) ** power, OTHER_STAND_OFF)  # fmt: skip
 
 
 def _periodic(place: str, period: float) -> Columns:

@@ -18,7 +18,7 @@ import scipy  # whose parts are loaded when they are used
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.network import Solution, solve
 from omsm_ros.core.adjustment.part_terms import FREE_M, FormTerms
-from omsm_ros.core.adjustment.refutation import ODDS_ABSENT, SURE, Doubt
+from omsm_ros.core.adjustment.refutation import ODDS_ABSENT, POSITIVE, SURE, Doubt
 from omsm_ros.core.adjustment.sources import FREE, Family, base_name
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
@@ -33,8 +33,6 @@ _RIM = 96
 _DRAWS = 300
 # Terms that are reported, and those that are fitted in addition.
 REPORTED_DEGREE, _FITTED_DEGREE = 4, 8
-# Twice the logarithm of odds that is worth more than a bare mention (Kass and Raftery 1995).
-_POSITIVE = 2.0
 
 
 @dataclass(frozen=True)
@@ -445,7 +443,7 @@ def _resembled(
             # Rounding of its many components would pass for information.
             shape, known = shape @ family.smooth, np.zeros((family.smooth.shape[1],) * 2)
         gain, values = form.looks_like(fit @ shape, known)
-        if gain > _POSITIVE:
+        if gain > POSITIVE:
             change = shape @ values
             weight = made.places.area * change
             shown = weight @ made.height / np.maximum(weight @ change, 1e-30)

@@ -20,6 +20,8 @@ _UNDECLARED_LIMIT = 4.5
 _DECLARED_LIMIT = 3.7
 # Twice the logarithm of odds of 150 : 1, "very strong" (Kass and Raftery 1995).
 _LEAST_GAIN = 10.0
+# Of odds that are worth more than a bare mention (there).
+POSITIVE = 2.0
 # Smaller than this no source matters to any accuracy asked of the method.
 _LEAST_EFFECT_M = 0.5e-9
 # Two explanations within this of each other in χ², or in their share of it, are not separated.
@@ -241,17 +243,20 @@ def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Sol
 
     What is neither declared nor seen in the residuals may be there, as large as the residuals and
     its plausible size allow: the form's uncertainty counts its mean square, which is that size
-    times the probability that it is there (Hoeting et al., Statist. Sci. 14, 382). Families that
-    explain a part of what was seen count by that part: no model is exact, so that the likelihood
-    alone would be too sure.
+    times the probability that it is there (Hoeting et al., Statist. Sci. 14, 382). A declaration
+    that the scans speak against, but do not refute, counts alike: it may be wrong by what they
+    found. Families that explain a part of what was seen count by that part: no model is exact, so
+    that the likelihood alone would be too sure.
     """
     sizes: dict[str, float | FloatArray] = dict(solution.sizes)
     for family in solution.network.families:
-        if family.named and family.name not in sizes:
-            one = evidence_of(solution, family)
-            there = 1 / (1 + ODDS_ABSENT * np.exp(-min(one.gain, SURE) / 2))
-            size = np.sqrt(there) * np.hypot(one.values, one.uncertainty)
+        one, declared = evidence_of(solution, family), solution.sizes.get(family.name)
+        root = np.sqrt(1 / (1 + ODDS_ABSENT * np.exp(-min(one.gain, SURE) / 2)))
+        if family.named and declared is None:
+            size = root * np.hypot(one.values, one.uncertainty)
             sizes[family.name] = np.minimum(size, family.wide)
+        elif family.named and declared is not None and one.gain > POSITIVE:
+            sizes[family.name] = np.hypot(declared, root * one.values)
     for refutation in refutations:
         for other in refutation.rivals:
             share = explained(other, refutation.evidence)

@@ -27,6 +27,8 @@ class Source:
     uncertainty: standard uncertainty of each of its components [unit of the family]
     correlation_length: of an unknown curve over its axis [m]; None: 0.7 of the axis' range
     period: of a periodic error over Z or over the distance [m]
+    half_range: distance at which a linearity error of the probe has its size [m]; None: the
+        largest in use
     evaluated: True if a recording on this machine gave the figure; what is only declared, and not
         shown by the scans, cannot turn a verdict green
 
@@ -38,6 +40,7 @@ class Source:
     correlation_length: float | None = None
     evaluated: bool = False
     period: float | None = None
+    half_range: float | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.uncertainty < np.inf:

@@ -95,28 +95,55 @@ def reasons_of(
     least: effect below which a cause has no name: the model of the form may have made it [m]
     """
     found = [Reason(WRONG_SIGN, (str(scan),), share, 0.0) for scan, share in wrong_sign]
-    causes = [r for r in refutations if not r.minor and r.name not in accepted]
-    if all(r.explains for r in causes):
-        for cause in causes:
-            code = REFUTED if base_name(cause.name) in declared else UNDECLARED_EFFECT
-            names: tuple[str, ...] = (cause.name, *cause.alike)
-            if not cause.evidence.family.named or cause.evidence.effect < least:
-                code, names = UNIDENTIFIED, ()
-            found.append(Reason(code, names, cause.evidence.deviate, 3.0))
-    else:
+    causes = [r for r in refutations if not r.minor and set(accepted).isdisjoint(_names(r))]
+    size, spread, stated = walk[0], walk[1], walk[2] or 0.0
+    beyond = (size - stated) / max(spread * stated, 1e-15)
+    walks = walk[2] is not None and beyond > _RARE_WALK
+    # To the centre time and slide are one, and a line whose phase wanders is none.
+    of_walk = ("drift_walk", "straightness_x", VIBRATION)
+    if not all(r.explains for r in causes):
         # A cause that no family explains may stand behind all others that were found.
-        largest = max(r.evidence.deviate for r in causes)
-        found.append(Reason(UNIDENTIFIED, (), largest, 3.0))
+        found.append(Reason(UNIDENTIFIED, (), max(r.evidence.deviate for r in causes), 3.0))
+        causes = []
+    elif walks and all(r.evidence.effect < size for r in causes):
+        # What wanders within half a turn passes for whatever is smaller than it.
+        named = [n for r in causes if r.evidence.family.named for n in _names(r)]
+        of_walk = tuple(dict.fromkeys((*of_walk, *named)))
+    else:
+        found += _named(causes, declared, least)
+        causes = []
     for one in agreement:
         if one.largest >= one.limit:
             found.append(Reason(DISAGREE, (str(one.scan),), one.largest, one.limit))
-    size, spread, stated = walk[0], walk[1], walk[2] or 0.0
     # Any other error that is left in the residuals passes for drift.
-    alone = not found and walk[2] is not None and "drift_walk" not in accepted
-    if alone and size > stated * (1 + _RARE_WALK * spread):
-        # To the centre time and slide are one, and a line whose phase wanders is none.
-        found.append(Reason(REFUTED, ("drift_walk", "straightness_x", VIBRATION), size, stated))
+    if walks and (causes or not found) and set(accepted).isdisjoint(of_walk):
+        found.append(Reason(REFUTED, of_walk, beyond, _RARE_WALK))
     return tuple(found)
+
+
+def _names(cause: Refutation) -> tuple[str, ...]:
+    return (cause.name, *cause.alike)
+
+
+def _named(causes: Sequence[Refutation], declared: Collection[str], least: float) -> list[Reason]:
+    """Return a reason for each of ``causes``, for those with a family in common one.
+
+    A family that explains two of them alone is the simpler explanation, and is named first.
+    """
+    found: list[Reason] = []
+    for cause in causes:
+        names, deviate = _names(cause), cause.evidence.deviate
+        if not cause.evidence.family.named or cause.evidence.effect < least:
+            found.append(Reason(UNIDENTIFIED, (), deviate, 3.0))
+            continue
+        for before in [r for r in found if not set(names).isdisjoint(r.names)]:
+            found.remove(before)
+            both = [n for n in before.names if n in names]
+            names = tuple(dict.fromkeys((*both, *before.names, *names)))
+            deviate = max(deviate, before.value)
+        code = REFUTED if base_name(names[0]) in declared else UNDECLARED_EFFECT
+        found.append(Reason(code, names, deviate, 3.0))
+    return found
 
 
 # Of the accuracy: what a source that is neither shown nor declared may do to the heights.

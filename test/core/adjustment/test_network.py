@@ -11,11 +11,13 @@ from plain_world import MIRROR, RADIUS_M, Machine
 from omsm_ros.core.adjustment.adjust import _network
 from omsm_ros.core.adjustment.blocks import SECTORS, block_begins, white_noise
 from omsm_ros.core.adjustment.evidence import evidence_of
+from omsm_ros.core.adjustment.families import families_of, ranges_of
 from omsm_ros.core.adjustment.figures import effects_on_form, places_of
 from omsm_ros.core.adjustment.network import Factor, solve
 from omsm_ros.core.adjustment.part_terms import part_model
-from omsm_ros.core.adjustment.refutation import start_scales
+from omsm_ros.core.adjustment.refutation import POSITIVE, completed, start_scales
 from omsm_ros.core.adjustment.scan_data import view_of, zero_of
+from omsm_ros.core.adjustment.sources import Source
 
 
 @pytest.fixture(scope="module")
@@ -191,3 +193,54 @@ def test_the_map_reaches_the_peaks_at_the_rim():
     wave = ((places.x + 1j * places.y) / RADIUS_M) ** 7
     turned = np.exp(1j * np.arange(0, 2 * np.pi, 0.1))[:, np.newaxis]
     assert np.min(np.ptp((wave * turned).real, axis=1)) > 0.997 * 2
+
+
+@pytest.mark.parametrize("share", [0.5, 4.0])
+def test_a_declaration_that_the_scans_speak_against_may_be_wrong(small, share):
+    """A steady drift without noise, of which the odds are below or above a bare mention."""
+    _, network, sizes = small
+    scales = start_scales(network, 1e-10)
+    family = next(f for f in network.families if f.name == "drift_rate")
+    column = network.column("drift_rate")[:, 0]
+
+    def solved(rate):
+        return solve(network, rate * column, scales, sizes)
+
+    def gain(rate):
+        return evidence_of(solved(rate), family).gain
+
+    # The gain grows with the rate.
+    low, high = 0.0, 2e-9
+    for _ in range(9):
+        rate = (low + high) / 2
+        low, high = (rate, high) if gain(rate) < share * POSITIVE else (low, rate)
+    before = solved(rate)
+    after = completed(before)
+    off, further = (
+        abs(s.values[network.place["drift_rate"]][0] - rate) / s.uncertainty("drift_rate")[0]
+        for s in (after, before)
+    )
+    if share < 1:
+        assert after.sizes["drift_rate"] == sizes["drift_rate"]
+    else:
+        assert further > 1.5
+        assert off < 0.7
+
+
+def test_a_linearity_is_declared_at_its_half_range(small):
+    """The column is one there, and its plausible size the same over the distances in use."""
+    views, _, _ = small
+    for end in (None, 50e-6):
+        families = families_of(ranges_of(views, linearity(end), (0, 0)), linearity(end))
+        for name, power in (("probe_square", 2), ("probe_linearity", 3)):
+            family = next(f for f in families if f.name == name)
+            used = max(float(np.max(np.abs(v.distance))) for v in views)
+            ends = end or max(used, 10e-6)
+            np.testing.assert_allclose(
+                family.columns(views[0])[0], (views[0].distance / ends) ** power
+            )
+            assert family.wide * (max(used, 10e-6) / ends) ** power == pytest.approx(1e-7)
+
+
+def linearity(end):
+    return [Source(n, 3e-9, half_range=end) for n in ("probe_linearity", "probe_square")]

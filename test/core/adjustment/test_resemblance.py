@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from omsm_ros.core.adjustment.evidence import Evidence
 from omsm_ros.core.adjustment.part_terms import FormTerms
@@ -69,12 +70,13 @@ def test_terms_that_a_small_scan_leaves_open_are_no_evidence():
     assert np.all(np.isfinite(values))
 
 
-def cause(name, deviate, explains=True):
+def cause(name, deviate, explains=True, alike=()):
     """A family that the scans show beyond its declaration."""
     family = Family(name, "m", 1, lambda view: view.x[np.newaxis], 1e-6, "reclocked")
     found = Evidence(family, np.ones(1), deviate**2, 1, 1e-8, deviate**2,
                      np.eye(1), declared=True)  # fmt: skip
-    return Refutation(found, (), explains=explains)
+    others = tuple(cause(other, deviate).evidence for other in alike)
+    return Refutation(found, others, explains=explains)
 
 
 def test_nothing_is_named_beside_a_cause_that_no_family_explains():
@@ -111,3 +113,25 @@ def test_a_form_that_looks_like_a_source_counts_by_what_that_may_do():
     found = looks_like([("pitch", 21e-9), ("pitch", 19e-9)], [family], (), 20e-9)
     assert [(r.names, r.value) for r in found] == [(("pitch", "reclocked"), 21e-9)]
     assert not looks_like([("pitch", 21e-9)], [family], ["pitch"], 20e-9)
+
+
+def test_what_explains_two_causes_alone_is_one_and_is_named_first():
+    causes = [cause("part_bow_speed", 5.0, alike=("creep", "drift_rate")),
+              cause("drift", 6.0, alike=("creep",))]  # fmt: skip
+    (one,) = reasons_of(causes, {"drift"}, (), (), (0.0, 0.1, None), ())
+    assert one.names == ("creep", "part_bow_speed", "drift_rate", "drift")
+    assert (one.code, one.value) == ("undeclared_effect", 6.0)
+    # Whichever of them is the cause, its found value is accepted.
+    assert not reasons_of(causes, {"drift"}, (), (), (0.0, 0.1, None), ("creep",))
+
+
+def test_what_is_smaller_than_an_undeclared_walk_may_be_made_by_it():
+    """A harmonic of 10 nm beside heights that wander by 90 nm in a second, of 1 nm declared."""
+    causes = [cause("spindle_axial/1.33", 14.0)]
+    walk = (90e-9, 0.05, 1e-9)
+    (one,) = reasons_of(causes, {"drift_walk"}, (), (), walk, ())
+    assert one.code == "refuted"
+    assert {"drift_walk", "spindle_axial/1.33"} <= set(one.names)
+    assert one.value == pytest.approx((90 - 1) / 0.05)
+    (one,) = reasons_of(causes, {"drift_walk"}, (), (), (2e-9, 0.05, 1e-9), ())
+    assert one.names == ("spindle_axial/1.33",)
