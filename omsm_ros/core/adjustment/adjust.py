@@ -205,7 +205,7 @@ def adjust(
         + looks_like(form.resembled, families, accepted, open_limit(accuracy)),
         rests_on(families, effects, form.mean_uncertainty),
         enough, 2 * form.pv.uncertainty, accuracy,
-        None if enough else best_addition(scans[0], priors, surface, removed)[:2],
+        None if enough else best_addition(scans[0], priors, surface, removed),
         calibration,
         largest_contribution(solution, effects, surface, removed, doubts, accuracy),
     )  # fmt: skip

@@ -13,7 +13,7 @@ import numpy as np
 
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.families import DIFFERS
-from omsm_ros.core.adjustment.figures import Figure, Places, places_of, pv_and_rms
+from omsm_ros.core.adjustment.figures import Figure, places_of, pv_and_rms
 from omsm_ros.core.adjustment.network import Solution, solve
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
@@ -60,19 +60,12 @@ def agreement_of(
         common = np.any(seen, axis=0)
     # A form has another PV where it is read elsewhere: all scans at the same places.
     places = places_of(solution, common)
-    alone = [_alone(solution, y, k, nominal, removed, places) for k in range(blocks.scans)]
+    alone = []
+    for k in range(blocks.scans):
+        scales = replace(solution.scales, noise=solution.scales.noise[[k]])
+        one = solve(solution.network.alone(k), y[blocks.scan == k], scales, {})
+        alone.append(pv_and_rms(one, nominal, removed, places))
     return tuple(_compared(solution, k, alone) for k in range(blocks.scans))
-
-
-def _alone(
-    solution: Solution, y: FloatArray, scan: int, nominal: Surface | None, removed: Sequence[str],
-    places: Places,
-) -> tuple[Figure, Figure]:  # fmt: skip
-    """Return PV and rms of the form by ``scan`` alone, at ``places`` that all scans saw."""
-    net = solution.network.alone(scan)
-    scales = replace(solution.scales, noise=solution.scales.noise[[scan]])
-    mine = solution.network.blocks.scan == scan
-    return pv_and_rms(solve(net, y[mine], scales, {}), nominal, removed, places)
 
 
 def _compared(

@@ -56,7 +56,10 @@ def lines_of(solution: Solution, view: ScanView) -> list[Line]:
     series = np.zeros(round(float(view.since[-1]) / period) + 1)
     series[np.round(view.since / period).astype(np.int64)] = left
     frequency: FloatArray = np.asarray(np.fft.rfftfreq(len(series), period), np.float64)
-    part = _of_the_part(frequency, abs(view.speed) / (2 * np.pi))
+    multiple = frequency / (abs(view.speed) / (2 * np.pi))
+    nearest = np.round(multiple)
+    part = (np.abs(multiple - nearest) < _SIDE_BAND) & (nearest <= _PART_HARMONICS)
+    part |= multiple < 0.9
     found: list[Line] = []
     while len(found) < _MOST_LINES:
         power = np.abs(np.fft.rfft(series * np.hanning(len(series)))) ** 2
@@ -64,7 +67,11 @@ def lines_of(solution: Solution, view: ScanView) -> list[Line]:
         peak = _summit(power, int(np.argmax(ratio)))
         if np.max(ratio) < _LINE_OVER_NOISE or part[peak] or not 0 < peak < len(power) - 1:
             break
-        refined = _refined(power, peak, frequency)
+        # By a parabola through the logarithms.
+        here = np.log(power[peak - 1 : peak + 2])
+        bend = here[0] - 2 * here[1] + here[2]
+        shift = 0.5 * (here[0] - here[2]) / bend if bend < 0 else 0.0
+        refined = float(frequency[peak] + shift * frequency[1])
         if not _lasting(series, 2 * np.pi * refined * period):
             break
         wave, series = _without(series, 2 * np.pi * refined * period)
@@ -107,22 +114,6 @@ def _floor(power: FloatArray) -> FloatArray:
     level = [float(np.median(power[a:b])) for a, b in pairwise(edges)]
     middle = (edges[:-1] + edges[1:]) / 2
     return np.asarray(np.interp(np.arange(len(power)), middle, level) / np.log(2.0))
-
-
-def _of_the_part(frequency: FloatArray, turning: float) -> FloatArray:
-    multiple = frequency / turning
-    nearest = np.round(multiple)
-    return np.asarray(
-        (np.abs(multiple - nearest) < _SIDE_BAND) & (nearest <= _PART_HARMONICS) | (multiple < 0.9)
-    )
-
-
-def _refined(power: FloatArray, peak: int, frequency: FloatArray) -> float:
-    """Return the frequency of a peak by a parabola through the logarithms."""
-    here = np.log(power[peak - 1 : peak + 2])
-    bend = here[0] - 2 * here[1] + here[2]
-    shift = 0.5 * (here[0] - here[2]) / bend if bend < 0 else 0.0
-    return float(frequency[peak] + shift * frequency[1])
 
 
 def line_family(line: Line) -> Family:
@@ -209,16 +200,10 @@ def _angle_step(solution: Solution, scan: int) -> Step:
     # Within the turn where it happens part of it is seen on either side.
     begin = float(since[np.argmax(turn >= best)])
     end = float(since[min(len(since) - 1, int(np.sum(turn <= best + 1)))])
-    time = _angle_break(since, left, centred, begin, end)
+    window = (since >= begin) & (since <= end)
+    # From there on the column is found in what is left with another coefficient.
+    time = _break(since[window], left[window] * np.sign(centred[window]))
     return Step(scan, "c_lost", time, float(size[best]))
-
-
-def _angle_break(
-    since: FloatArray, left: FloatArray, column: FloatArray, first: float, last: float
-) -> float:
-    """Return the time from which on ``column`` is found in ``left`` with another coefficient."""
-    window = (since >= first) & (since <= last)
-    return _break(since[window], left[window] * np.sign(column[window]))
 
 
 def step_family(step: Step) -> Family:

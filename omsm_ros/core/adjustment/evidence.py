@@ -64,18 +64,12 @@ class Evidence:
 
         if not self.dof:
             return 0.0
-        log_tail = _log_tail(self.chi_square, self.dof)
+        half, order = self.chi_square / 2, self.dof / 2
+        tail = special.gammaincc(order, half)
+        # Beyond what a float holds, its asymptote.
+        far = (order - 1) * np.log(max(half, 1.0)) - half - special.gammaln(order)
+        log_tail = np.log(tail) if tail > 1e-290 else far
         return float(max(-special.ndtri_exp(log_tail - np.log(2.0)), 0.0))
-
-
-def _log_tail(chi_square: float, dof: int) -> float:
-    from scipy import special
-
-    tail = special.gammaincc(dof / 2, chi_square / 2)
-    if tail > 1e-290:
-        return float(np.log(tail))
-    half = chi_square / 2
-    return float((dof / 2 - 1) * np.log(half) - half - special.gammaln(dof / 2))
 
 
 def evidence_of(solution: Solution, family: Family) -> Evidence:

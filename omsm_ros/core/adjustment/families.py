@@ -32,7 +32,8 @@ class Ranges:
     motion, distance, radius: half ranges [m]
     slide, lift: least and greatest slide x and motion [m];  clampings: number of each scan's
     durations, feeds: of each scan [s], of slide x [m/s]
-    lengths, periods, half_ranges: declared, by family [m]
+    lengths, periods: declared, by family [m]
+    half_range: distance for which linearity errors are declared [m]; ``distance`` where none are
     """
 
     speed: float
@@ -40,6 +41,7 @@ class Ranges:
     duration: float
     motion: float
     distance: float
+    half_range: float
     radius: float
     slide: tuple[float, float]
     lift: tuple[float, float]
@@ -48,7 +50,6 @@ class Ranges:
     feeds: tuple[float, ...]
     lengths: Mapping[str, float] = field(default_factory=dict)
     periods: Mapping[str, float] = field(default_factory=dict)
-    half_ranges: Mapping[str, float] = field(default_factory=dict)
 
 
 # A probe that is driven through less of its range shows no error of it: the plausible size of its
@@ -69,12 +70,14 @@ def ranges_of(
         return float(min(map(np.min, values))), float(max(map(np.max, values)))
 
     lift, distance = ends("motion"), ends("distance")
+    used = max(*map(abs, distance), _LEAST_DISTANCE_M)
     return Ranges(
         speeds=tuple(v.speed for v in views),
         speed=float(np.mean([abs(v.speed) for v in views])),
         duration=ends("time")[1] or 1.0,
         motion=(lift[1] - lift[0]) / 2 or 1.0,
-        distance=max(*map(abs, distance), _LEAST_DISTANCE_M),
+        distance=used,
+        half_range=next((p.half_range for p in priors if p.half_range is not None), used),
         radius=float(max(np.max(np.hypot(v.x, v.y)) for v in views)),
         slide=ends("slide_x"),
         lift=lift,
@@ -83,7 +86,6 @@ def ranges_of(
         feeds=tuple(float((v.slide_x[-1] - v.slide_x[0]) / (v.since[-1] or 1.0)) for v in views),
         lengths={p.name: p.correlation_length for p in priors if p.correlation_length is not None},
         periods={p.name: p.period for p in priors if p.period is not None},
-        half_ranges={p.name: p.half_range for p in priors if p.half_range is not None},
     )
 
 
@@ -152,7 +154,9 @@ def _dynamic(r: Ranges) -> list[Family]:
         _one("lag_motion", "s", lambda v: v.motion_rate * (v.motion - middle) / r.motion, 1e-4,
              OTHER_SPEED),
         _one("lag_x", "s", lambda v: v.motion_rate * (v.slide_x / far - 0.5), 1e-4, OTHER_SPEED),
-        _lag_time(r),
+        # From the first scan on, and from the beginning of each.
+        Family("lag_time", "s", 2, lambda v: v.motion_rate * np.stack(
+            [v.time / r.duration, v.since / r.durations[v.index]]), 1e-4, OTHER_SPEED),
         _one("lag_rate", "s", lambda v: v.motion_rate * np.abs(v.motion_rate) / fast, 1e-4,
              OTHER_SPEED),
         Family("lag_c", "s", 2, lambda v: v.motion_rate * np.stack(_waves(v.c, 1)), 1e-4,
@@ -175,12 +179,6 @@ def _dynamic(r: Ranges) -> list[Family]:
         found.append(_one("lag_direction", "s", lambda v: v.motion_rate * np.sign(v.speed), 5e-5,
                           OTHER_SPEED))  # fmt: skip
     return found
-
-
-def _lag_time(r: Ranges) -> Family:
-    """Return a lag that changes from the first scan on, and from the beginning of each."""
-    return Family("lag_time", "s", 2, lambda v: v.motion_rate * np.stack(
-        [v.time / r.duration, v.since / r.durations[v.index]]), 1e-4, OTHER_SPEED)  # fmt: skip
 
 
 def _of_each_direction(r: Ranges) -> list[Family]:
@@ -263,7 +261,7 @@ def _curve(
 
 def _of_the_probe(r: Ranges) -> list[Family]:
     """Scale, linearity, slope and periodic errors of probe and encoder of Z, and the beam."""
-    fast = r.motion * r.speed
+    fast, end = r.motion * r.speed, r.half_range
     places = {"encoder_interpolation": "motion", "probe_periodic": "distance"}
     return [
         *(Family(name, "m", 2, _periodic(places[name], period), 1e-7, OTHER_STAND_OFF)
@@ -275,20 +273,15 @@ def _of_the_probe(r: Ranges) -> list[Family]:
         _one("probe_slope_moving", "m", lambda v: np.hypot(v.slope_x, v.slope_y)
              * np.abs(v.motion_rate) / fast, 1e-7, OTHER_SPEED),
         _one("static_gain", "1", lambda v: -v.distance, 1e-2, OTHER_STAND_OFF),
-        _of_distance("probe_square", 2, r),
-        _of_distance("probe_linearity", 3, r),
+        _one("probe_square", "m", lambda v: (v.distance / end) ** 2,
+             1e-7 * (end / r.distance) ** 2, OTHER_STAND_OFF),
+        _one("probe_linearity", "m", lambda v: (v.distance / end) ** 3,
+             1e-7 * (end / r.distance) ** 3, OTHER_STAND_OFF),
         _one("probe_slope_square", "m/rad", lambda v: v.slope_x**2 + v.slope_y**2, 1e-5,
              REFERENCE),
         Family("beam", "1", 2, lambda v: np.stack(
             [v.across(v.distance, 0.0), v.across(0.0, v.distance)]), 1e-2, OTHER_STAND_OFF),
     ]  # fmt: skip
-
-
-def _of_distance(name: str, power: int, r: Ranges) -> Family:
-    """Return a power of the distance, one at the declared half range, else at the range in use."""
-    end = r.half_ranges.get(name, r.distance)
-    return _one(name, "m", lambda v: (v.distance / end) ** power,
-                1e-7 * (end / r.distance) ** power, OTHER_STAND_OFF)  # fmt: skip
 
 
 def _periodic(place: str, period: float) -> Columns:

@@ -248,17 +248,12 @@ def design_scan(design: ScanDesign, nominal: Surface, begin: float, shown: float
 
 def best_addition(
     scan: ScanData, priors: Sequence[Source], nominal: Surface, removed: Sequence[str] = POSE
-) -> tuple[str, float, float]:
-    """Return the code of the scan to add to ``scan`` that helps most, and what form then is.
-
-    Also returned: standard uncertainty of the form of ``scan`` alone, planned likewise [m].
-    """
+) -> tuple[str, float]:
+    """Return the code of the scan to add to ``scan`` that helps most, and what form then is [m]."""
     first = design_of(scan)
-    alone = posterior_uncertainty([first], priors, nominal, removed).form
     reached = {
         code: posterior_uncertainty([first, added], priors, nominal, removed).form
         for code, added in additions(first).items()
         if code != REPEATED_TRACK  # leaves the set without redundancy
     }
-    best = min(reached, key=lambda code: reached[code])
-    return best, reached[best], alone
+    return min(reached.items(), key=lambda item: item[1])

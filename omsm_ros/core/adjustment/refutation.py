@@ -97,20 +97,14 @@ def start_scales(network: Network, walk: float | None) -> Scales:
 def settled(solution: Solution, steps: int) -> Solution:
     """Return the solution after ``steps`` estimates of its scales, fewer once they are constant."""
     for _ in range(steps):
-        scales = estimate_scales(solution)
-        still = _alike(scales, solution.scales)
+        before, scales = solution.scales, estimate_scales(solution)
         solution = solve(solution.network, solution.y, scales, solution.sizes)
-        if still:
+        one, other = (np.append(s.noise, s.walk) for s in (scales, before))
+        cells = max(0.3 * scales.cells, 1e-4 * float(np.min(one)))
+        close = np.all(np.abs(one - other) < _SETTLED * one)
+        if close and abs(scales.cells - before.cells) < cells:
             break
     return solution
-
-
-def _alike(one: Scales, other: Scales) -> bool:
-    """Return whether drift, noise and cells differ by too little to matter."""
-    pairs = np.array([[one.walk, other.walk], *zip(one.noise, other.noise, strict=True)])
-    close = np.all(np.abs(np.diff(pairs)) < _SETTLED * pairs[:, :1])
-    least = float(np.min(pairs[:, 0])) * 1e-4
-    return bool(close and abs(one.cells - other.cells) < max(0.3 * one.cells, least))
 
 
 def fit_and_refute(

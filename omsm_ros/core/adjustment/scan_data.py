@@ -27,6 +27,8 @@ from omsm_ros.errors import DataError
 LEAST_POINTS = 200
 # At the 12th harmonic of a turn a second the rate is 1 % short.
 _HALF_WINDOW_S, _POLYNOMIAL = 12e-3, 4
+# Creep of guides and mounts that a step test with plateaus of half a second does not show.
+_CREEP_S = 2.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -189,6 +191,10 @@ def view_of(scan: ScanData, index: int, zero: Zero, nominal: Surface) -> ScanVie
     x_rate, y_rate = (_rate(scan.time, v) for v in (x, y))
     slope_x, slope_y = slopes_by_differences(nominal, x, y)
     deviation = scan.height - zero.height - nominal.height(x, y)
+    # Creep: the mean of the motion over the last seconds, fading, less the motion.
+    step = float(np.median(np.diff(scan.time))) / _CREEP_S
+    start = [scan.motion[0] * (1 - step)]
+    followed, _ = scipy.signal.lfilter([step], [1, step - 1], scan.motion, zi=start)
     return ScanView(
         time=scan.time - zero.time,
         since=scan.time - scan.time[0],
@@ -205,7 +211,7 @@ def view_of(scan: ScanData, index: int, zero: Zero, nominal: Surface) -> ScanVie
         motion=scan.motion - zero.motion,
         motion_rate=_rate(scan.time, scan.motion),
         motion_acceleration=_of_neighbours(scan, _rate(scan.time, scan.motion, 2)),
-        motion_fading=_fading(scan.time, scan.motion),
+        motion_fading=followed - scan.motion,
         # The measured distance holds the form itself, as a regressor it would take it away.
         distance=scan.distance - zero.distance - deviation,
         removed=scan.removed,
@@ -238,7 +244,9 @@ def _rate(time: FloatArray, values: FloatArray, order: int = 1) -> FloatArray:
                 values[run], 2 * half + 1, _POLYNOMIAL, deriv=order, delta=period
             )
         else:
-            made[run] = 0.0 if order == 2 else _slope(time[run], values[run])
+            ends = run[[0, -1]]
+            slope = np.diff(values[ends]) / max(float(np.diff(time[ends])[0]), 1e-12)
+            made[run] = 0.0 if order == 2 else slope
     return made
 
 
@@ -259,21 +267,6 @@ def _of_neighbours(scan: ScanData, values: FloatArray) -> FloatArray:
     for found in (2 * last - before, 2 * following - after, (last + following) / 2):
         values = np.where(np.isfinite(found), found, values)
     return values
-
-
-# Creep of guides and mounts that a step test with plateaus of half a second does not show.
-_CREEP_S = 2.0
-
-
-def _fading(time: FloatArray, motion: FloatArray) -> FloatArray:
-    """Return the mean of ``motion`` over the last two seconds, fading, less ``motion``."""
-    step = float(np.median(np.diff(time))) / _CREEP_S
-    start = [motion[0] * (1 - step)]
-    return np.asarray(scipy.signal.lfilter([step], [1, step - 1], motion, zi=start)[0] - motion)
-
-
-def _slope(time: FloatArray, values: FloatArray) -> float:
-    return float((values[-1] - values[0]) / (time[-1] - time[0])) if len(time) > 1 else 0.0
 
 
 # Degree of the slopes' polynomial: on the paper's mirror the eighth is 4 pm.

@@ -15,7 +15,6 @@ import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.adjustment.families import families_of, ranges_of
 from omsm_ros.core.adjustment.scan_data import ScanData, ScanView, view_of, zero_of
-from omsm_ros.core.adjustment.sources import Family
 from omsm_ros.core.kinematics.kinematics import Geometry, Surface
 from omsm_ros.core.registration.probe_alignment import Alignment
 from omsm_ros.core.streams.blocks import FloatArray
@@ -101,7 +100,11 @@ def evaluate_sources(
     for family in families:
         here = slice(first, first + family.size)
         first += family.size
-        one = _found(family, values[here], spread[here], ranges.distance)
+        name, _, order = family.name.partition("/")
+        rms, unsure = (float(np.sqrt(np.mean(v[here] ** 2))) for v in (values, spread))
+        linear = name in ("probe_linearity", "probe_square")
+        one = FoundSource(name, family.unit, rms, unsure, float(order) if order else None,
+                          ranges.half_range if linear else None)  # fmt: skip
         if one.uncertainty < _SHOWN_SHARE * family.wide:
             found.append(one)
         else:
@@ -117,20 +120,6 @@ def evaluate_sources(
     if kind == STILL:
         found.insert(0, FoundSource("probe_noise", "m", noise, noise / np.sqrt(2 * len(view))))
     return tuple(found), tuple(missing)
-
-
-def _found(
-    family: Family, values: FloatArray, spread: FloatArray, half_range: float
-) -> FoundSource:
-    name, _, order = family.name.partition("/")
-    return FoundSource(
-        name,
-        family.unit,
-        float(np.sqrt(np.mean(values**2))),
-        float(np.sqrt(np.mean(spread**2))),
-        float(order) if order else None,
-        half_range if name in ("probe_linearity", "probe_square") else None,
-    )
 
 
 def sources_of_alignment(

@@ -100,7 +100,7 @@ def reasons_of(
     beyond = (size - stated) / max(spread * stated, 1e-15)
     walks = walk[2] is not None and beyond > _RARE_WALK
     # To the centre time and slide are one, and a line whose phase wanders is none.
-    of_walk = ("drift_walk", "straightness_x", VIBRATION)
+    of_walk: tuple[str, ...] = ("drift_walk", "straightness_x", VIBRATION)
     if not all(r.explains for r in causes):
         # A cause that no family explains may stand behind all others that were found.
         found.append(Reason(UNIDENTIFIED, (), max(r.evidence.deviate for r in causes), 3.0))
