@@ -57,7 +57,7 @@ _FREE_DELAYS = (0.0, 1.0, 4.0, 15.0)
 _LEAST_SAMPLES_EACH = 3
 # Sixty columns of a record then take half a gigabyte.
 _MOST_SAMPLES = 1_000_000
-# Used samples on which orders are explored.
+# Used samples of all records together on which orders are explored.
 EXPLORED_ON = 8000
 # Iterations of a start in a race, of an explored, of a refitted and of the final fit.
 _RACE, _EXPLORING, _REFITTED, _FINAL = 3, 12, 4, 30
@@ -113,7 +113,7 @@ def choose_sampled(
     none = np.zeros(records[0].inputs.shape[1], np.int64)
     whole = SectionsProblem(records, hold, none)
     if hold != BAND_LIMITED and max_delay:
-        parts = replace(whole, records=[_exciting_part(record) for record in records])
+        parts = replace(whole, records=_exciting_parts(records))
         late = _confirmed(_with_delays(parts, max_delay)[0], min(_CONFIRMING_ORDER, most))
         whole = replace(whole, delays=late.delays)
     explored, every, most = _explored(whole, order, most)
@@ -143,7 +143,7 @@ def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsPr
     """
     every = min(_decimation(record) for record in whole.records)
     while True:
-        records = [_exciting_part(_thinned(record, every)) for record in whole.records]
+        records = _exciting_parts([_thinned(record, every) for record in whole.records])
         try:
             most = min(most, check_records(records, order))
         except IdentificationError:
@@ -208,15 +208,16 @@ def excited_parameters(input: FloatArray, most: int) -> int:
     return int(np.sum(power > _UNEXCITED * power[-1]))
 
 
-def _exciting_part(record: SampledRecord) -> SampledRecord:
-    """Return the part with EXPLORED_ON used samples in which the inputs vary most."""
-    places = np.flatnonzero(record.used)
-    count = len(places) // EXPLORED_ON
-    if count < 2:
-        return record
-    ends = places[: count * EXPLORED_ON].reshape(count, -1)[:, [0, -1]].tolist()
-    parts = [record.part(slice(first, last + 1)) for first, last in ends]
-    return max(parts, key=lambda part: float(np.var(part.inputs, axis=0).sum()))
+def _exciting_parts(records: Sequence[SampledRecord]) -> list[SampledRecord]:
+    """Return of each record the part in which the inputs vary most; they share EXPLORED_ON."""
+    most, found = EXPLORED_ON // len(records), []
+    for record in records:
+        places = np.flatnonzero(record.used)
+        whole = places[: len(places) // most * most].reshape(-1, most)
+        ends = whole[:, [0, -1]].tolist() if len(whole) > 1 else [(0, len(record) - 1)]
+        parts = [record.part(slice(first, last + 1)) for first, last in ends]
+        found.append(max(parts, key=lambda part: float(np.var(part.inputs, axis=0).sum())))
+    return found
 
 
 def _parts(used: BoolArray) -> FloatArray:

@@ -93,10 +93,7 @@ def identify_samples(
     corrected = sections.response(frequency) + _missed(choice.chosen, frequency * period)
     others = [other.response(frequency * period) for other in choice.alternatives]
     others_of = np.array([corrected, *others], np.complex128).transpose(1, 0, 2)
-    valid = [
-        valid_range(sections, blocks, frequency, input, each)
-        for input, each in enumerate(others_of)
-    ]
+    valid = [valid_range(sections, blocks, frequency, i, each) for i, each in enumerate(others_of)]
     entries = _entries(choice, sections, valid)
     first = records[0]
     steady = stationary_output(sections, first.inputs, first.output, first.used)
