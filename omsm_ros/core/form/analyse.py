@@ -27,6 +27,7 @@ from omsm_ros.core.form.part_figures import (
     TILT,
     best_fit,
     fitted,
+    length,
     less,
     products,
     rms_of_part,
@@ -69,8 +70,8 @@ _COVERED_WELL = 0.02
 MOST_WEIGHED = 2**19
 # Largest width of a profile relative to its length.
 _LINE_WIDTH = 1e-6
-# Two standard deviations of an estimate of noise from 6000 points.
-_CHANCE = 1.04
+# Standard deviation of an estimate of noise from 6000 points, as a share of it.
+_CHANCE = 0.02
 # A hundred points for each Zernike term.
 _MOST_POINTS = 4_000
 
@@ -402,6 +403,6 @@ class _Gathered:
         estimates = [*np.median(self._noise, axis=0), neighbour_noise(x, y, deviation)]
         least, next_ = sorted(map(float, [*estimates, fitted]))[:2]
         # The rest of the fit scatters least, so that a little less in another one is chance.
-        if least < fitted < _CHANCE * least:
-            return fitted, True, float(np.min(np.abs(np.subtract(estimates, fitted))))
-        return least, True, next_ - least
+        if least < fitted < (1 + 2 * _CHANCE) * least:
+            next_, least = least, fitted
+        return least, True, length(next_ - least, _CHANCE * least)
