@@ -301,12 +301,11 @@ def _textures(
     outline: Aperture | None,
 ) -> dict[str, UncertainValue]:
     """Return texture and slopes;  maps: of the part, and without its second order."""
-    parts = without_terms(maps[0], found.disc, FORM), maps[1]
-    formless, rest = (GridCells.of(part, even=outline is None) for part in parts)
-    points = None
+    points: DeviationMap | None = without_terms(maps[0], found.disc, FORM)
+    formless, rest = (GridCells.of(part, even=outline is None) for part in (points, maps[1]))
     # Without an S-filter the surface has waves that the cells do not resolve.
-    if cells.width > 0 and bands.s_filter is None:
-        points = short_waves(parts[0], formless, bands.l_filter)
+    resolved = cells.width == 0 or bands.s_filter is not None
+    points = None if resolved else short_waves(points, formless, bands.l_filter)
     made = texture(cells, formless, bands, points, rest)
     if points is not None:
         whole, _, beyond = extents_of_parts([points], found.disc, outline, found.spacing)[0]
@@ -404,5 +403,5 @@ class _Gathered:
         least, next_ = sorted(map(float, [*estimates, fitted]))[:2]
         # The rest of the fit scatters least, so that a little less in another one is chance.
         if least < fitted < (1 + 2 * _CHANCE) * least:
-            next_, least = least, fitted
+            return fitted, True, fitted - least
         return least, True, length(next_ - least, _CHANCE * least)

@@ -39,7 +39,7 @@ _GROUPS = np.array([_RINGS if t.m == 0 and t.n > 2 else t.n for t in _TERMS])
 # Relative change of the variances at convergence; parts need 8 to 40 iterations.
 _TURNS, _SETTLED = 300, 1e-3
 # Amplitudes of optical figure errors fall with the second to fourth power of their order.
-_STEEPEST = 4
+_STEEPEST, _FALL, _FALL_ERROR = 4, 3.0, 1.0
 # Lower bounds of σ_g: a picometre, so that the variance has an inverse, and a tenth of the
 # variance that noise leaves of a term, below which data cannot show it.
 _LEAST_M = 1e-12
@@ -249,22 +249,39 @@ def _upper_variances(sizes: FloatArray, unknown: FloatArray, group: IntArray) ->
     """Return the upper 85 % bounds of the variances ``sizes`` (k,) of the terms.
 
     unknown: share of each term that the data leave open (k,). For the ν terms that determine the
-    variance of a group the bound is ν/χ²(ν, 15 %) of it, by Wilson and Hilferty's approximation.
-    An order of which the pose takes all terms may exceed the next by the steepest fall.
+    variance of a group the bound is ν/χ²(ν, 15 %) of it, by Wilson and Hilferty's approximation. A
+    power law through the other orders counts as 2/v terms, with v the variance of its logarithm,
+    or as fewer if the order departs from it by more than chance.
     """
-    upper, above, share = sizes.copy(), 0.0, 1.0
-    for each in np.unique(group)[::-1]:
+    upper = sizes.copy()
+    # Noise hides terms of all orders, so those seen count in units of the best seen.
+    seen = (1 - unknown) / max(float(np.max((1 - unknown)[group != _RINGS], initial=0.0)), 1e-3)
+    for each in np.unique(group):
         chosen = group == each
-        known = float(np.sum(1 - unknown[chosen]))
+        known, log = float(np.sum(1 - unknown[chosen])), np.log(sizes[chosen])
+        others = ~chosen & (group != _RINGS)
+        if each != _RINGS and np.any(others):
+            terms = max(float(np.sum(seen[chosen])), 1e-3)
+            law, variance = _power_law(sizes[others], seen[others], group[others] / each)
+            by_law = 2 / max(variance, float(np.max(log - law)) ** 2 - 2 / terms)
+            log = (terms * log + by_law * law) / (terms + by_law)
+            known += by_law
         spread = 2 / (9 * max(known, 1.0))
-        upper[chosen] *= (1 - spread - _QUANTILE * np.sqrt(spread)) ** -3
-        if each != _RINGS:
-            # Noise hides terms of both orders, so those seen count in units of the next.
-            taken = max(1 - known / max(share, 1e-3), 0.0)
-            least = above * ((each + 1) / each) ** (2 * _STEEPEST) * taken
-            upper[chosen] = np.maximum(upper[chosen], least)
-            above, share = float(upper[chosen].max()), known / np.count_nonzero(chosen)
+        upper[chosen] = np.exp(log) * (1 - spread - _QUANTILE * np.sqrt(spread)) ** -3
     return upper
+
+
+def _power_law(sizes: FloatArray, seen: FloatArray, order: FloatArray) -> tuple[float, float]:
+    """Return the logarithm at order 1 of a power law through ``sizes`` (k,), and its variance.
+
+    A term has the Fisher information seen²/2 about the logarithm of its variance.
+    """
+    weights = seen**2 / 2
+    columns = np.stack([np.ones_like(order), -2 * np.log(order)])
+    information = (columns * weights) @ columns.T + np.diag([1e-9, _FALL_ERROR**-2])
+    covariance = np.linalg.inv(information)
+    right = columns @ (weights * np.log(sizes)) + np.array([0.0, _FALL / _FALL_ERROR**2])
+    return float(covariance[0] @ right), float(covariance[0, 0])
 
 
 def _sizes(form: FloatArray, unknown: FloatArray, least: FloatArray, group: IntArray) -> FloatArray:

@@ -36,11 +36,21 @@ def test_a_size_found_from_few_terms_may_be_larger(terms, unknown):
     assert factor == pytest.approx(known / stats.chi2.ppf(0.15, known), rel=0.03)
 
 
-def test_form_of_which_no_term_is_seen_may_rise_like_the_steepest():
-    """A toroid with free radii and clocking takes all of order 2; amplitudes fall with n⁻⁴."""
-    order = np.repeat([2, 3, 4], [3, 4, 5])
-    two, three, _ = np.unique(_upper_variances(np.ones(12), 1.0 * (order == 2), order))[::-1]
-    assert two == pytest.approx(max(three * 1.5**8, 41), rel=0.01)
+@pytest.mark.parametrize("fall", [2, 3, 4])
+def test_form_of_which_no_term_is_seen_continues_the_fall_of_the_others(fall):
+    """A toroid with free radii and clocking takes all of order 2; its bound is above the law."""
+    order = np.repeat(np.arange(2, 9), np.arange(3, 10))
+    law = order ** (-2.0 * fall)
+    unseen = 1.0 * (order == 2)
+    found = _upper_variances(np.where(order == 2, 1e3, law), unseen, order)
+    assert 1 < found[0] / law[0] < 3 * _upper_variances(law, 0 * unseen, order)[0] / law[0]
+
+
+def test_one_large_term_is_not_drawn_to_the_law_of_the_others():
+    """Clamping makes 300 nm of astigmatism alone; the bound is no smaller than the term."""
+    order = np.repeat(np.arange(2, 9), np.arange(3, 10))
+    sizes = np.where(order == 2, 300e-9, 1e-9) ** 2
+    assert _upper_variances(sizes, np.where(order == 2, 1 / 3, 0.0), order)[0] > 300e-9**2
 
 
 @pytest.mark.soak
