@@ -301,13 +301,13 @@ def _textures(
     outline: Aperture | None,
 ) -> dict[str, UncertainValue]:
     """Return texture and slopes;  maps: of the part, and without its second order."""
-    points: DeviationMap | None = without_terms(maps[0], found.disc, FORM)
+    points = without_terms(maps[0], found.disc, FORM)
     formless, rest = (GridCells.of(part, even=outline is None) for part in (points, maps[1]))
     # Without an S-filter the surface has waves that the cells do not resolve.
     resolved = cells.width == 0 or bands.s_filter is not None
-    points = None if resolved else short_waves(points, formless, bands.l_filter)
-    made = texture(cells, formless, bands, points, rest)
-    if points is not None:
+    points = points if resolved else short_waves(points, formless, bands.l_filter)
+    made = texture(cells, formless, bands, None if resolved else points, rest)
+    if not resolved:
         whole, _, beyond = extents_of_parts([points], found.disc, outline, found.spacing)[0]
         made |= {"Sq": rms_of_part(points, beyond), "Sz": whole}
     return made
@@ -396,8 +396,7 @@ class _Gathered:
             return repeated, True, 0.0
         spans = sorted((float(np.ptp(x)), float(np.ptp(y))))
         if spans[0] <= _LINE_WIDTH * spans[1]:
-            along = x if np.ptp(x) > np.ptp(y) else y
-            return *profile_noise(along, deviation), 0.0
+            return *profile_noise(x if np.ptp(x) > np.ptp(y) else y, deviation), 0.0
         # Points may come in any order, where successive points are no neighbours.
         estimates = [*np.median(self._noise, axis=0), neighbour_noise(x, y, deviation)]
         least, next_ = sorted(map(float, [*estimates, fitted]))[:2]

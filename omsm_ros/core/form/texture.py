@@ -173,12 +173,9 @@ def _of_points(map_: DeviationMap) -> _FilteredBand:
     """Return the points, each as often as its area demands, as a band that no S-filter changed."""
     ends = np.cumsum(map_.area)
     even = np.searchsorted(ends, (np.arange(len(map_)) + 0.5) / len(map_) * ends[-1])
-    random = np.random.default_rng(_NOISE_SEED)
-    level = np.empty((1 + _DRAWS, len(map_)))
-    level[0] = map_.deviation[even]
-    for row in level[1:]:
-        row[:] = random.normal(0, map_.noise, len(map_))[even]
-    return _FilteredBand([level], map_.effects[:, even], map_.noise_known)
+    level = np.random.default_rng(_NOISE_SEED).normal(0, map_.noise, (1 + _DRAWS, len(map_)))
+    level[0] = map_.deviation
+    return _FilteredBand([level[:, even]], map_.effects[:, even], map_.noise_known)
 
 
 # Of one image: level and slopes along x and y (3, 1 + draws + e, r, c), for each cutoff.

@@ -38,7 +38,7 @@ _RINGS = HIGHEST_ORDER + 1
 _GROUPS = np.array([_RINGS if t.m == 0 and t.n > 2 else t.n for t in _TERMS])
 # Relative change of the variances at convergence; parts need 8 to 40 iterations.
 _TURNS, _SETTLED = 300, 1e-3
-# Amplitudes of optical figure errors fall with the second to fourth power of their order.
+# Amplitudes of optical figure errors fall with the second to fourth power of their order (±1).
 _STEEPEST, _FALL, _FALL_ERROR = 4, 3.0, 1.0
 # Lower bounds of σ_g: a picometre, so that the variance has an inverse, and a tenth of the
 # variance that noise leaves of a term, below which data cannot show it.
@@ -92,8 +92,7 @@ class FormBasis:
         gram = (values * (area / area.sum())) @ values.T
         rows: list[FloatArray] = []
         groups: list[int] = []
-        for place in range(len(_TERMS)):
-            row = np.eye(len(_TERMS))[place]
+        for place, row in enumerate(np.eye(len(_TERMS))):
             for _ in range(2):  # the second pass removes rounding errors of the first
                 for other in rows:
                     row = row - (other @ gram @ row) * other
@@ -200,7 +199,8 @@ def estimate(
     scale[dofs:] = 1.0
     points = float(np.median(np.diag(gram)[dofs:]))
     noise = max(variance, _LEAST_M**2, points * _BEST_KNOWN_M**2)
-    normal, right = gram / np.outer(scale, scale) / noise, moments / scale / noise
+    scales = np.outer(scale, scale)
+    normal, right = gram / scales / noise, moments / scale / noise
     value, spread = expected[0] * scale[:dofs], expected[1] * scale[:dofs]
     normal[np.arange(dofs), np.arange(dofs)] += 1 / spread**2
     right[:dofs] -= value / spread**2
@@ -212,28 +212,18 @@ def estimate(
         unknown = np.diag(covariance)[dofs:] / sizes
         new = _sizes(found[dofs:], unknown, least, group)
         new = np.clip(new, least, np.maximum(_MOST_SHARE * largest, least))
-        change = float(np.max(np.abs(np.log(new / sizes))))
-        sizes = new
+        change, sizes = float(np.max(np.abs(np.log(new / sizes)))), new
         if change < _SETTLED:
             break
-    likely = covariance[:dofs, :dofs]
+    likely = covariance[:dofs, :dofs] / scales[:dofs, :dofs]
     sizes = _upper_variances(sizes, np.diag(covariance)[dofs:] / sizes, group)
     covariance = _inverse(normal, sizes, dofs)
-    found = covariance @ right / scale
-    return Estimate(
-        step=found[:dofs],
-        form=found[dofs:],
-        covariance=covariance / np.outer(scale, scale),
-        sizes=np.sqrt(sizes),
-        noise=noise,
-        likely=likely / np.outer(scale, scale)[:dofs, :dofs],
-    )
+    step, form = np.split(covariance @ right / scale, [dofs])
+    return Estimate(step, form, covariance / scales, np.sqrt(sizes), noise, likely)
 
 
 def _inverse(normal: FloatArray, sizes: FloatArray, dofs: int) -> FloatArray:
-    full = normal.copy()
-    index: IntArray = np.arange(dofs, len(full))
-    full[index, index] += 1 / sizes
+    full = normal + np.diag(np.append(np.zeros(dofs), 1 / sizes))
     root = 1 / np.sqrt(np.diag(full))
     try:
         inverse = np.linalg.inv(full * np.outer(root, root)) * np.outer(root, root)
@@ -276,12 +266,10 @@ def _power_law(sizes: FloatArray, seen: FloatArray, order: FloatArray) -> tuple[
 
     A term has the Fisher information seen²/2 about the logarithm of its variance.
     """
-    weights = seen**2 / 2
     columns = np.stack([np.ones_like(order), -2 * np.log(order)])
-    information = (columns * weights) @ columns.T + np.diag([1e-9, _FALL_ERROR**-2])
-    covariance = np.linalg.inv(information)
-    right = columns @ (weights * np.log(sizes)) + np.array([0.0, _FALL / _FALL_ERROR**2])
-    return float(covariance[0] @ right), float(covariance[0, 0])
+    weighted, prior = columns * seen**2 / 2, np.array([0.0, _FALL_ERROR**-2])
+    first = np.linalg.inv(weighted @ columns.T + np.diag([1e-9, prior[1]]))[0]
+    return float(first @ (weighted @ np.log(sizes) + _FALL * prior)), float(first[0])
 
 
 def _sizes(form: FloatArray, unknown: FloatArray, least: FloatArray, group: IntArray) -> FloatArray:
@@ -290,7 +278,7 @@ def _sizes(form: FloatArray, unknown: FloatArray, least: FloatArray, group: IntA
     They fall with ``n**-_STEEPEST`` at most, because a shift of an asphere looks like coma: trefoil
     alone must not bound the coma.  unknown: share of each term that the data leave open (k,)
     """
-    new, above, below = np.empty_like(form), 0.0, 0.0
+    new, above = np.empty_like(form), 0.0
     for each in np.unique(group)[::-1]:
         chosen = group == each
         known = max(float(np.sum(1 - unknown[chosen])), 1e-3)
@@ -298,13 +286,9 @@ def _sizes(form: FloatArray, unknown: FloatArray, least: FloatArray, group: IntA
         if each != _RINGS:
             value = above = max(value, above)
         new[chosen] = value
-    for each in range(2, HIGHEST_ORDER + 1):
-        chosen = group == each
-        below *= ((each - 1) / each) ** (2 * _STEEPEST)
-        if np.any(chosen):
-            below = max(below, float(new[chosen].max()))
-            new[chosen] = below
-    return new
+    ratio = group / group[:, np.newaxis]
+    lower = np.where(ratio <= 1, ratio, 0.0) ** (2 * _STEEPEST)
+    return np.where(group == _RINGS, new, np.max(lower * new, axis=1))
 
 
 def outlier_limit(residual: FloatArray) -> float:
