@@ -41,8 +41,8 @@ def test_where_nothing_is_stated_nothing_is_exceeded() -> None:
 
 def test_what_one_scan_cannot_show_is_assumed_as_the_adjustment_assumes_it() -> None:
     extent = Ranges(
-        speeds=(3.0,), speed=3.0, duration=100.0, motion=1e-4, distance=1e-5, radius=1e-2,
-        slide=(0.0, 1e-2), lift=(0.0, 1e-4), clampings=(0,),
+        speeds=(3.0,), speed=3.0, duration=100.0, motion=1e-4, distance=1e-5, half_range=1e-5,
+        radius=1e-2, slide=(0.0, 1e-2), lift=(0.0, 1e-4), clampings=(0,),
         durations=(100.0,), feeds=(1e-4,),
     )  # fmt: skip
     defaults = {f.name: f.default for f in families_of(extent, ()) if f.name in ASSUMED_SIZES}
