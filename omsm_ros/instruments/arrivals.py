@@ -324,8 +324,8 @@ class MissedTriggerDetector:
 def _edge(rest: FloatArray) -> float:
     """Return how likely arrivals with these rests (n,) above a line [period] lie at an edge (log).
 
-    If there is no edge, each of k arrivals is within a width w of the line by a chance of w, so the
-    log likelihood is -k log w for the likeliest k. The two that define the line do not count.
+    Without an edge an arrival is within a width w of the line by a chance of w. For the likeliest
+    number k of arrivals the log likelihood is -k log w; the two that define the line do not count.
     """
     width = np.maximum(np.sort(rest)[2:], _NARROWEST)
     return float(np.max(-np.arange(1, len(width) + 1) * np.log(width)))

@@ -79,7 +79,7 @@ def in_child(
         child.start()
     sender.close()
     until = time.monotonic() + seconds
-    # What it does first, which includes loading modules.
+    # The process begins with this stage, which includes loading modules.
     kind, content = _PROGRESS, cast("Any", {"stage": "reading"})
     try:
         while kind == _PROGRESS:

@@ -153,7 +153,7 @@ def priors_of(stated: MachineSources, abbe_arm: float = 0.0) -> tuple[Source, ..
         size = float(np.hypot(before.uncertainty, prior.uncertainty))
         found[prior.name] = replace(prior, uncertainty=size)
     if cubic := found.get("probe_linearity"):
-        # What is declared of a linearity is not of one shape only.
+        # A declared linearity error may be of any shape.
         found["probe_square"] = replace(cubic, name="probe_square")
     return tuple(found.values())
 

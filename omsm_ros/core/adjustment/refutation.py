@@ -20,7 +20,7 @@ _UNDECLARED_LIMIT = 4.5
 _DECLARED_LIMIT = 3.7
 # Twice the logarithm of odds of 150 : 1, "very strong" (Kass and Raftery 1995).
 _LEAST_GAIN = 10.0
-# Of odds that are worth more than a bare mention (there).
+# The same of odds of e : 1, "positive" evidence (the same table).
 POSITIVE = 2.0
 # Smaller than this no source matters to any accuracy asked of the method.
 _LEAST_EFFECT_M = 0.5e-9

@@ -106,7 +106,7 @@ def reasons_of(
         found.append(Reason(UNIDENTIFIED, (), max(r.evidence.deviate for r in causes), 3.0))
         causes = []
     elif walks and all(r.evidence.effect < size for r in causes):
-        # What wanders within half a turn passes for whatever is smaller than it.
+        # A drift within half a turn looks like any source with a smaller effect.
         named = [n for r in causes if r.evidence.family.named for n in _names(r)]
         of_walk = tuple(dict.fromkeys((*of_walk, *named)))
     else:

@@ -178,7 +178,7 @@ def _of_points(map_: DeviationMap) -> _FilteredBand:
     return _FilteredBand([level[:, even]], map_.effects[:, even], map_.noise_known)
 
 
-# Of one image: level and slopes along x and y (3, 1 + draws + e, r, c), for each cutoff.
+# Level and slopes of one image along x and y (3, 1 + draws + e, r, c), for each cutoff.
 _Planes = list[FloatArray]
 
 

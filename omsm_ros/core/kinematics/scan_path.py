@@ -160,7 +160,7 @@ def _content_without(slow: FloatArray, velocity: FloatArray, sample_period: floa
     moved, mean, square = (
         np.cumsum(np.append(line, 0.0)[::-1])[::-1] for line in (power - noise, noise, noise**2)
     )
-    # Of the noise in them: its scatter, and the uncertainty of its level, which is a median.
+    # The noise adds its scatter, and the uncertainty of its level, which is a median.
     deviation = np.sqrt(square + (mean / np.log(2)) ** 2 / (len(power) / 2))
     # `moved` has the positive frequencies only, half of Parseval's sum.
     slowly = float(np.sum((slow - np.mean(slow)) ** 2)) * len(velocity) / 2

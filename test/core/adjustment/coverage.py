@@ -18,7 +18,7 @@ from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
 
 SPINDLE = {2: 12e-9, 3: 9e-9, 4: 5e-9}
 STRAIGHTNESS_M, STRETCH = 2e-9, 2e-6
-ASIDE_M, BEND_M, SQUARENESS_RAD, PARALLELISM_RAD = 3e-8, 1e-9, 1e-7, 1e-5
+LATERAL_M, BEND_M, SQUARENESS_RAD, PARALLELISM_RAD = 3e-8, 1e-9, 1e-7, 1e-5
 LAG_S, RAMP_M_S, DECENTRE_M, CLOCKING_RAD = 50e-6, 0.15e-9, 2e-8, 5e-7
 PRIORS = (
     Source("lag_change", LAG_S),
@@ -28,7 +28,7 @@ PRIORS = (
     Source("part_turn", CLOCKING_RAD),
     # What a spiral to the centre does not show.
     Source("straightness_x", STRAIGHTNESS_M, evaluated=True),
-    Source("straightness_z", ASIDE_M, evaluated=True),
+    Source("straightness_z", LATERAL_M, evaluated=True),
     Source("pitch", BEND_M, evaluated=True),
     Source("lag_speed", 1e-7, evaluated=True),
     Source("squareness", SQUARENESS_RAD, evaluated=True),
@@ -72,7 +72,7 @@ def drawn(seed, scans, pitch=0.4e-3, **errors):
     more = np.random.default_rng(2000 + seed)
     ways = {}
     for name in ("x_of_z", "y_of_z"):
-        height, way = curve(more, min(0.0, *lift), max(lift), ASIDE_M)
+        height, way = curve(more, min(0.0, *lift), max(lift), LATERAL_M)
         # The mean is the spindle centre, a source of its own.
         ways[name] = height, way - np.mean(way) + PARALLELISM_RAD * more.normal() * height
     ways["bend_of_z"] = curve(more, min(0.0, *lift), max(lift), BEND_M)

@@ -106,12 +106,12 @@ class Machine:
         there = place(c, r)
         z = MIRROR.height(*there)
         bow = wrong.get("bow_of_z", 0.0) * (np.cos(np.pi * (z / 0.6e-3)) - 1)
-        aside = [np.interp(z, *wrong[n]) if n in wrong else 0.0 for n in ("x_of_z", "y_of_z")]
+        lateral = [np.interp(z, *wrong[n]) if n in wrong else 0.0 for n in ("x_of_z", "y_of_z")]
         seen = place(
             c - self.latency * omega + wrong.get("c_lost", 0.0) * (t > 0.5 * duration)
             + wrong.get("c_once", 0.0) * np.cos(c),
-            r - self.latency * r_rate, wrong.get("centre_x", 0.0) + bow + aside[0],
-            wrong.get("centre_y", 0.0) + aside[1],
+            r - self.latency * r_rate, wrong.get("centre_x", 0.0) + bow + lateral[0],
+            wrong.get("centre_y", 0.0) + lateral[1],
         )  # fmt: skip
         at = (seen[0] + 1j * seen[1]) * np.exp(-1j * turned) - complex(*moved)
         seen = (at.real, at.imag)

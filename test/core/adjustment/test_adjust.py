@@ -60,7 +60,7 @@ def test_the_lag_is_found_to_a_fifth_of_a_microsecond(table):
 
 
 def test_the_effect_of_a_source_is_that_of_its_found_value(table):
-    """Of a lag by the rate of Z; of pitch by its declaration, not by what the scans alone know."""
+    """A lag acts by the rate of Z; pitch counts by its declaration, not by the scans alone."""
     _, scans, (_, two, _) = table
     rate = np.concatenate([s.removed for s in scans[:2]]) / 340e-6
     lag, pitch = two.source("lag_change"), two.source("pitch")

@@ -339,7 +339,7 @@ def test_a_narrow_band_of_the_model_counts_where_nothing_contradicts_it(
     assert (low < 0.5 < high) if valid else low == high
 
 
-def test_distortion_of_lines_is_told_from_noise_by_those_between(monkeypatch):
+def test_distortion_of_lines_is_separated_from_noise_by_those_between(monkeypatch):
     rng, period, lines = np.random.default_rng(4), 200, np.arange(1, 90)
     turned = np.exp(2j * np.pi * rng.random(len(lines)))
     distorted = lines > 50

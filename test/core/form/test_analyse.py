@@ -48,7 +48,7 @@ def test_any_arrangement_of_points_is_judged(arrangement):
 
 
 def test_the_noise_is_not_the_least_of_what_estimates_of_it_are_by_chance():
-    """Of 3 maps whose form is far below the noise; about zero by area is the rms of the points."""
+    """Three maps have a form far below the noise; about zero by area is the rms of the points."""
     x, y = (v.ravel() for v in np.meshgrid(*(np.linspace(-0.01, 0.01, 60),) * 2))
     true, found = [], []
     for seed in range(3):
