@@ -73,9 +73,8 @@ def test_terms_lie_within_their_uncertainty(two_scans):
 @pytest.mark.timeout(300)
 def test_form_errors_are_as_large_as_stated(two_scans):
     rows, found = two_scans
-    error = np.sqrt(np.mean([row[4] ** 2 for row in rows]))
-    stated = np.sqrt(np.mean([f.form.mean_uncertainty**2 for f in found]))
-    assert 0.7 < error / stated < 1.15
+    off = [row[4] / f.form.mean_uncertainty for row, f in zip(rows, found, strict=True)]
+    assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.15
 
 
 @pytest.mark.soak
