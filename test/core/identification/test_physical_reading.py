@@ -121,7 +121,7 @@ def test_masses_and_springs_scatter_as_stated():
     over = []
     for seed in range(1, 9):
         entry = identified(MACHINE.non_collocated(), seed).certificate.response.two_mass
-        model, stated = entry["model"], entry["relative_uncertainty"]
+        model, stated = entry.model, entry.relative_uncertainty
         over.append(
             [np.log(model[n] * MACHINE.m1 / getattr(MACHINE, n)) / stated[n] for n in FITTED]
         )
