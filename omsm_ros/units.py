@@ -211,7 +211,9 @@ def _called(metres: float) -> str:
 
 
 def name_and_unit(text: str) -> tuple[str, float | None]:
-    """Return name in lower case and unit [m] of ``x [mm]``, ``X/mm``, ``x (mm)`` or ``x_mm``."""
-    found = re.fullmatch(r"\s*(.+?)\s*[\[(/_]\s*([^\s\[\](),/_]+)\s*[\])]?\s*", text)
+    """Return name in lower case and unit [m] of ``x [mm]``, ``X/mm``, ``x_mm`` or ``x mm``."""
+    found = re.fullmatch(
+        r"\s*(.+?)(?:\s*[\[(/_]|\s(?:in\s)?)\s*([^\s\[\](),/_]+)\s*[\])]?\s*", text
+    )
     unit = metres_in(found[2]) if found else None
     return (found[1].strip().lower(), unit) if found and unit else (text.strip().lower(), None)

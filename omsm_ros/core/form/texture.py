@@ -476,15 +476,8 @@ def _ring(x: FloatArray, y: FloatArray, *radii: float) -> float:
 
 def _around(x: FloatArray, y: FloatArray, deviation: FloatArray, radius: float) -> Profile:
     outer = np.hypot(x, y) >= _OUTER * radius
-    angle = np.arctan2(y[outer], x[outer])
-    count = round(360 / _DEGREES)
-    place = np.floor((angle + np.pi) / (2 * np.pi) * count).astype(np.int64) % count
-    points = np.bincount(place, minlength=count)
-    filled = points > 0
-
-    rows = [np.bincount(place, v, count)[filled] for v in (angle, *deviation[:, outer])]
-    position, *values = np.array(rows) / points[filled]
-    return Profile(position, np.array(values), points[filled])
+    angle, spacing = np.arctan2(y[outer], x[outer]), _DEGREES * np.pi / 180
+    return line_profile(angle, 0 * angle, deviation[:, outer], half_width=1.0, spacing=spacing)
 
 
 def _with_effects(map_: DeviationMap) -> FloatArray:

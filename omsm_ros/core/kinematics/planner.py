@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import interpolate
 
 from omsm_ros.core.streams.blocks import FloatArray
 
@@ -72,12 +71,14 @@ def executed(at: FloatArray, time: FloatArray, values: FloatArray, cycle: float)
 
 def averaged(at: FloatArray, time: FloatArray, values: FloatArray, ramp: float) -> FloatArray:
     """Return the polygon through ``values`` (n,) at ``time`` (n,), averaged over ``ramp`` [s]."""
+    from scipy.interpolate import make_interp_spline  # takes 0.3 s to load
+
     if ramp <= 0:
         return np.asarray(np.interp(at, time, values))
     reach = ramp + max(float(time[0] - np.min(at)), float(np.max(at) - time[-1]), 0.0)
     longer = np.concatenate([[time[0] - reach], time, [time[-1] + reach]])
     held = np.concatenate([values[:1], values, values[-1:]])
-    integral = interpolate.make_interp_spline(longer, held, k=1).antiderivative()
+    integral = make_interp_spline(longer, held, k=1).antiderivative()
     return np.asarray((integral(at + ramp / 2) - integral(at - ramp / 2)) / ramp)
 
 

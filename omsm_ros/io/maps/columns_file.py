@@ -81,13 +81,27 @@ def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
     )
 
 
+# The header of a matrix of heights: Gwyddion's ends with width, height and unit of the heights, in
+# any language; an interferometer's has rows, columns, pixel, and a factor.
+_NUMBER = r"\s*(\d+[.,]?\d*(?:e[-+]?\d+)?)"
+_OF_GWYDDION = rf":{_NUMBER}\s*(\S+)\n[^:\n]+:{_NUMBER}\s*(\S+)\n[^:\n]+:()\s*(\S+)$"
+_OF_PIXELS = (
+    rf"h *={_NUMBER}\s+w *={_NUMBER}\npixel size *={_NUMBER}\s*(\S+)\n"
+    rf".*\n.*factor \(-> (\S+)\) *={_NUMBER}$"
+)
+
+
 def _sizes_of_matrix(header: list[str]) -> list[float]:
-    """Return width, height and unit of the values [m] of a matrix of Gwyddion; none of another."""
-    pattern = r"[#\s]*(width|height|value units):\s*((?:\d+\.?\d*(?:e[-+]?\d+)?)?)\s*(\S+)\s*"
-    lines = [one for line in header if (one := re.fullmatch(pattern, line, re.IGNORECASE))]
-    sizes = {f[1].lower(): float(f[2] or 1) * (metres_in(f[3]) or 0.0) for f in lines}
-    found = [sizes.get(name, 0.0) for name in ("width", "height", "value units")]
-    return found if all(found) else []
+    """Return width, height and unit of the values [m] of a matrix of heights; none of another."""
+    text = "\n".join(filter(None, header)).replace(",", ".")
+    found: list[tuple[Any, str]] = []
+    if one := re.search(_OF_GWYDDION, text, re.IGNORECASE):
+        found = list(zip(one.groups()[::2], one.groups()[1::2], strict=True))
+    elif one := re.search(_OF_PIXELS, text, re.IGNORECASE):
+        rows, columns, size, unit, of_heights, factor = one.groups()
+        found = [(float(n) * float(size), unit) for n in (columns, rows)] + [(factor, of_heights)]
+    sizes = [float(size or 1) * (metres_in(unit) or 0.0) for size, unit in found]
+    return sizes if all(sizes) else []
 
 
 def _matrix(

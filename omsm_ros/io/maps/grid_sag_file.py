@@ -35,7 +35,7 @@ def is_grid_sag(first: str, second: str) -> bool:
     if numbers is None:
         return False
     lengths = len(second.split()), len(first.split())
-    return _has_unit(numbers) or lengths[1] != lengths[0] in _NUMBERS_OF_A_POINT
+    return numbers[4] in range(len(_UNITS_M)) or lengths[1] != lengths[0] in _NUMBERS_OF_A_POINT
 
 
 def _first_line(text: str) -> tuple[float, ...] | None:
@@ -47,10 +47,6 @@ def _first_line(text: str) -> tuple[float, ...] | None:
         return None
     whole = all(n == int(n) >= 5 for n in numbers[:2]) and numbers[4] == int(numbers[4])
     return numbers if whole and min(abs(numbers[2]), abs(numbers[3])) > 0 else None
-
-
-def _has_unit(first: tuple[float, ...]) -> bool:
-    return first[4] in range(len(_UNITS_M))
 
 
 def read_grid_sag(path: Path, units: LengthUnits | None = None) -> HeightGrid:
@@ -72,7 +68,7 @@ def read_grid_sag(path: Path, units: LengthUnits | None = None) -> HeightGrid:
                 f"{what} must begin with columns, rows (5 or more), two spacings, unit and "
                 "decentres"
             )
-        if not _has_unit(first):
+        if first[4] not in range(len(_UNITS_M)):
             raise FileError(
                 f"{what} has unit {int(first[4])}, the fifth number of its first line, expected "
                 "0 (mm), 1 (cm), 2 (inch) or 3 (m); correct it"

@@ -243,6 +243,7 @@ def _by_topography(
             chosen = chosen_channel(names, channel, holds.index(True) if True in holds else 0, what)
             found = reader.topography(channel_index=chosen)
         height = np.ma.filled(np.asanyarray(found.heights(), np.float64), np.nan)
+        height[np.abs(height) > 1e30] = np.nan  # SDF: the largest number of its type
         MAP_POINTS.checked(height.size, FileError, f"{what}: number of points")
         along = np.asarray(found.positions(), np.float64) if height.ndim == 1 else None
     notes = (f"read by SurfaceTopography as {type(reader).__name__}", channel_note(names, chosen))
@@ -278,6 +279,7 @@ def _holds_heights(channel: Any) -> bool:
 # The greatest number of points, of eight bytes each, and their description.
 MAX_UNPACKED_BYTES = 8 * int(MAP_POINTS.high) + 4_000_000
 
+_CHECKSUM = "md5checksum.hex"
 _REVISION = re.compile(rb"<(?:[\w.-]+:)?Revision>([^<]*)<")
 # Letters and digits of a revision, and its text in the standard.
 _REVISIONS = {
@@ -319,18 +321,23 @@ def read_x3p(path: Path, channel: str | None = None) -> MeasuredPoints:
 def _with_known_revision(archive: zipfile.ZipFile) -> io.BytesIO | None:
     """Return the archive with the revision spelled as x3pio expects; None if it already is.
 
-    Some programs deviate from the standard: ISO5436_2000, ISO25178-72:2017.
+    Some programs deviate: ISO5436_2000, ISO25178-72:2017; others repeat the checksum of the heights
+    in place of that of main.xml.
     """
-    main = archive.read("main.xml")
+    main, names = archive.read("main.xml"), archive.namelist()
     found = _REVISION.search(main)
     bare = re.sub(rb"[^a-z0-9]", b"", found[1].lower()) if found else b""
-    if found is None or bare not in _REVISIONS or found[1].strip() == _REVISIONS[bare]:
+    if found is None or bare not in _REVISIONS:
+        return None
+    sums = b"".join(archive.read(name) for name in names if name.endswith(_CHECKSUM))
+    others = [name for name in names if name != "main.xml" and name.encode() in sums]
+    if found[1].strip() == _REVISIONS[bare] and not others:
         return None
     spelled = io.BytesIO()
     with zipfile.ZipFile(spelled, "w") as made:
         for member in archive.infolist():
             # The checksum of main.xml is no longer valid.
-            if member.filename.endswith("md5checksum.hex"):
+            if member.filename.endswith(_CHECKSUM):
                 continue
             content = archive.read(member)
             if member.filename == "main.xml":

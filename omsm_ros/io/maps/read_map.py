@@ -11,7 +11,7 @@ from omsm_ros.io.maps import instrument_files
 from omsm_ros.io.maps.columns_file import has_dabam_header, read_columns, read_dabam
 from omsm_ros.io.maps.grid_sag_file import is_grid_sag, read_grid_sag
 from omsm_ros.io.maps.instrument_files import read_foreign, read_x3p
-from omsm_ros.io.maps.vertex_file import read_pcd, read_ply
+from omsm_ros.io.maps.vertex_file import read_cloud
 from omsm_ros.units import NOT_USED, LengthUnits
 
 _HEAD_BYTES = 4096
@@ -67,10 +67,8 @@ def _read(path: Path, units: LengthUnits | None, channel: str | None) -> Measure
     if suffix == ".x3p":
         return _in_own_units(read_x3p(path, channel), units)
     points = None
-    if head.startswith((b"ply\n", b"ply\r\n")):
-        points = read_ply(path, units)
-    elif head.startswith((b"# .PCD", b"VERSION")):
-        points = read_pcd(path, units)
+    if head.startswith((b"ply\n", b"ply\r\n", b"# .PCD", b"VERSION")):
+        points = read_cloud(path, units)
     elif head.startswith(instrument_files.METROPRO_MAGIC):
         points = _in_own_units(instrument_files.read_metropro(path), units)
     elif has_dabam_header(path):

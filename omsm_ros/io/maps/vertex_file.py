@@ -31,29 +31,20 @@ _PLY_NAMES = {"f4": "float", "f8": "double", "u4": "uint", "i4": "int"}
 _PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
-def read_ply(path: Path, units: LengthUnits | None) -> MeasuredPoints:
-    """Read the vertices of a PLY file; metres if ours, else ``units``. FileError if incomplete."""
+def read_cloud(path: Path, units: LengthUnits | None) -> MeasuredPoints:
+    """Read a PLY or a PCD file; metres if ours, else ``units``. FileError if incomplete."""
     what = f"cloud {str(path)!r}"
     with open_regular(path, FileError, "cloud") as stream:
-        lines = _header(stream, "end_header", what)
-        form = next((line.split()[1] for line in lines if line.startswith("format ")), "")
-        if form not in _PLY_ORDERS:
-            raise FileError(f"{what} is a PLY of format {shown(form)}; write it as binary or ascii")
-        dtype, count = _ply_vertices(lines, _PLY_ORDERS[form], what)
-        table = _records(stream, dtype, count, form == "ascii", what)
-    return _points(table, lines, units, what)
-
-
-def read_pcd(path: Path, units: LengthUnits | None) -> MeasuredPoints:
-    """Read the points of a PCD file; metres if ours, else ``units``. FileError if incomplete."""
-    what = f"cloud {str(path)!r}"
-    with open_regular(path, FileError, "cloud") as stream:
-        lines = _header(stream, "DATA ", what)
+        ply = stream.readline(_LONGEST_LINE).strip() == b"ply"
+        stream.seek(0)
+        lines = _header(stream, "end_header" if ply else "DATA ", what)
         entries = {parts[0]: parts[1:] for line in lines if (parts := line.split())}
-        dtype, count = _pcd_points(entries, what)
-        form = (entries.get("DATA") or [""])[0]
-        if form not in ("ascii", "binary"):
-            raise FileError(f"{what} holds its points as {shown(form)}; write it as binary")
+        form = (entries.get("format" if ply else "DATA") or [""])[0]
+        if form not in (_PLY_ORDERS if ply else ("ascii", "binary")):
+            raise FileError(f"{what} is of format {shown(form)}; write it as binary or ascii")
+        dtype, count = (
+            _ply_vertices(lines, _PLY_ORDERS[form], what) if ply else _pcd_points(entries, what)
+        )
         table = _records(stream, dtype, count, form == "ascii", what)
     return _points(table, lines, units, what)
 
@@ -152,12 +143,11 @@ def _points(
     ours = set(names) >= _OURS or any(IN_METRES in line for line in lines)
     metres = LengthUnits(1.0, 1.0)
     scale = metres if ours else needed(units, what)
-    height = "height" if "height" in names else "z"
     spread = _scaled(table["uncertainty"]) if ours and "uncertainty" in names else None
     return measured(
         _scaled(table["x"], scale.lateral),
         _scaled(table["y"], scale.lateral),
-        _scaled(table[height], scale.height),
+        _scaled(table["height" if "height" in names else "z"], scale.height),
         None if spread is None or not np.any(np.isfinite(spread)) else spread,
         notes=(NOT_USED,) if ours and units not in (None, metres) else (),
         sample=table["sample"] if ours and "sample" in names else None,
@@ -169,8 +159,7 @@ def _scaled(values: NDArray[Any], scale: float = 1.0) -> NDArray[np.float64]:
     with np.errstate(invalid="ignore"):
         found = values.astype(np.float64)
     found[np.isnan(found)] = np.nan
-    if scale != 1.0:
-        found *= scale
+    found *= scale
     return np.asarray(found)
 
 

@@ -185,6 +185,8 @@ def test_an_unknown_unit_is_refused(text):
         ("Height (Angstrom)", "height", 1e-10),
         ("speed [m/s]", "speed [m/s]", None),
         ("sample", "sample", None),
+        ("Lateral um", "lateral", 1e-6),
+        ("x in µm", "x", 1e-6),
     ],
 )
 def test_name_and_unit(text, name, unit):
@@ -271,15 +273,23 @@ def test_by_place_sees_a_transposed_map():
     assert not np.allclose(by_place(made), by_place(other))
 
 
-def test_a_matrix_of_heights_has_the_sizes_and_units_of_its_header(tmp_path):
-    """Gwyddion exports the first row at the top: a height of x + 2 y comes back."""
-    x, y = np.meshgrid((np.arange(20) + 0.5) * 1e-6, (np.arange(10) + 0.5)[::-1] * 2e-6)
+@pytest.mark.parametrize(
+    "head",
+    [
+        "# Channel: Z\n# Width: 20.0 µm\n# Height: 0.02 mm\n# Value units: nm\n",
+        "# Kanal: Z\n# Breite: 20,0 µm\n# Höhe: 0,02 mm\n# Werteeinheiten: nm\n",
+        "h=10 w=20\npixel size=1.0e-006 m\ndata unit=rad\nheight conversion factor (-> m)=1E-009\n",
+    ],
+)
+def test_a_matrix_of_heights_has_the_sizes_and_units_of_its_header(tmp_path, head):
+    """Programs export the first row at the top: a height of x + 2 y comes back."""
+    pitch = 1e-6 if "pixel" in head else 2e-6
+    x, y = np.meshgrid((np.arange(20) + 0.5) * 1e-6, (np.arange(10) + 0.5)[::-1] * pitch)
     path, height = tmp_path / "matrix.txt", x + 2 * y
     height[3, 4] = np.nan
-    head = "Channel: Z\nWidth: 20.0 µm\nHeight: 0.02 mm\nValue units: nm"
-    np.savetxt(path, height * 1e9, header=head, encoding="utf-8")
+    np.savetxt(path, height * 1e9, header=head.rstrip(), comments="", encoding="utf-8")
     found = read_points(path)
     assert len(found) == 199
     assert found.missing == 1
     assert found.height == pytest.approx(found.x + 2 * found.y, rel=1e-12)
-    assert (np.ptp(found.x), np.ptp(found.y)) == pytest.approx((19e-6, 18e-6))
+    assert (np.ptp(found.x), np.ptp(found.y)) == pytest.approx((19e-6, 9 * pitch))

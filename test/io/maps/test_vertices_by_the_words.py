@@ -115,7 +115,7 @@ def test_non_numeric_bits_are_reported_as_missing(tmp_path, kind):
         (b"property float x", b"property list uchar float x", "vertices with more than numbers"),
         (b"property float x", b"property quad x", "vertices with more than numbers"),
         (b"property float x", b"property float y", "name each once"),
-        (b"format binary_little_endian 1.0\n", b"", "a PLY of format ''; write it as binary or"),
+        (b"format binary_little_endian 1.0\n", b"", "is of format ''; write it as binary or"),
         (b"vertex 3", b"vertex 0", "number of points is 0"),
         (b"vertex 3", b"vertex -3", "number of points is '-3'"),
         (b"vertex 3", "vertex ٣".encode(), "number of points is"),

@@ -43,3 +43,17 @@ def test_a_revision_that_nobody_knows_is_refused(tmp_path):
     respelled(tmp_path / "a.x3p", tmp_path / "b.x3p", "ISO9999 - 2040")
     with pytest.raises(FileError, match="ISO9999"):
         read_points(tmp_path / "b.x3p")
+
+
+@pytest.mark.parametrize(("named", "read"), [("bindata/data.bin", True), ("main.xml", False)])
+def test_a_checksum_of_the_heights_says_nothing_of_the_description(tmp_path, named, read):
+    """SurfaceTopography 1.27 writes it; a wrong one of the description itself is refused."""
+    instrument_files.write_x3p(tmp_path / "a.x3p", made := grid(), "")
+    respelled(tmp_path / "a.x3p", tmp_path / "b.x3p", "ISO5436 - 2000")
+    with zipfile.ZipFile(tmp_path / "b.x3p", "a") as archive:
+        archive.writestr("md5checksum.hex", f"{'0' * 32} *{named}\n")
+    if read:
+        assert len(read_points(tmp_path / "b.x3p")) == np.isfinite(made.height).sum()
+    else:
+        with pytest.raises(FileError, match="checksum"):
+            read_points(tmp_path / "b.x3p")
