@@ -4,6 +4,7 @@
 never came are ``lost``; bytes that hold none are counted by the decoder of the protocol.
 """
 
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
@@ -96,7 +97,9 @@ class StreamDevice:
         small = not counting.timed and counting.modulus <= _SMALL_COUNTER
         self._small_counter = counting.modulus if small else 0
         self._cutter = BlockCutter(settings, channels)
+        self._identity: dict[str, str] = {}
         self.decoded = 0
+        self._counting_lock = threading.RLock()  # held while samples pass from one count to another
         self._heard = self._opened = monotonic()
         self._came_ns, self._came_at = 0, self._heard  # of the last bytes
         self._down = False
@@ -156,7 +159,7 @@ class StreamDevice:
     @property
     def identity(self) -> dict[str, str]:
         """Return make, model, version and settings as the device reported them; empty before."""
-        return {}
+        return self._identity
 
     @property
     def settings(self) -> dict[str, object]:
@@ -226,9 +229,10 @@ class StreamDevice:
         return StreamStatistics(**found)
 
     def counts(self) -> dict[str, float]:
-        """Return all statistics by name, those of the protocol included."""
-        decoder = self._decoder
-        return asdict(self.statistics) | (vars(decoder.statistics) if decoder is not None else {})
+        """Return all statistics by name, those of the protocol included; from any thread."""
+        found = {} if self._decoder is None else vars(self._decoder.statistics)
+        with self._counting_lock:
+            return asdict(self.statistics) | found
 
     def _prepare(self) -> None:
         """Set the device up; raises DeviceError."""
@@ -268,22 +272,24 @@ class StreamDevice:
             raise
 
     def _add(self, samples: Samples, arrival_ns: int, silent: float) -> list[BlockPair]:
-        self.decoded += len(samples)
-        after_silence = self._down or silent > self._settings.pause
-        self._down = False
-        runs = list(self._tracker.split(samples, silent, broken=after_silence))
-        if runs:
-            self._went_on = self._monotonic()
-        waited = self._ahead() * self._settings.sample_period
-        came_ns = arrival_ns - round(waited * NANOSECONDS_PER_S)
-        came = self._came_at - waited
-        return list(self._cutter.add(runs, came_ns, came, after_silence=after_silence))
+        with self._counting_lock:
+            self.decoded += len(samples)
+            after_silence = self._down or silent > self._settings.pause
+            self._down = False
+            runs = list(self._tracker.split(samples, silent, broken=after_silence))
+            if runs:
+                self._went_on = self._monotonic()
+            waited = self._ahead() * self._settings.sample_period
+            came_ns = arrival_ns - round(waited * NANOSECONDS_PER_S)
+            came = self._came_at - waited
+            return list(self._cutter.add(runs, came_ns, came, after_silence=after_silence))
 
     def _end(self, arrival_ns: int) -> list[BlockPair]:
         """Return all samples that waited for the next ones."""
-        rest, blocks = self._rest(), []
-        if len(rest):
-            silent, self._heard = max(self._came_at - self._heard, 0.0), self._came_at
-            blocks = self._add(rest, self._came_ns or arrival_ns, silent)
-        blocks += self._cutter.add(list(self._tracker.settle()), arrival_ns, self._came_at)
-        return [*blocks, *self._cutter.flush()]
+        with self._counting_lock:
+            rest, blocks = self._rest(), []
+            if len(rest):
+                silent, self._heard = max(self._came_at - self._heard, 0.0), self._came_at
+                blocks = self._add(rest, self._came_ns or arrival_ns, silent)
+            blocks += self._cutter.add(list(self._tracker.settle()), arrival_ns, self._came_at)
+            return [*blocks, *self._cutter.flush()]

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import threading
 import time
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from hypothesis import strategies as st
 
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.errors import DeviceError
+from omsm_ros.instruments.blocks import BlockPair
 from omsm_ros.instruments.counting import Counting, SequenceTracker
 from omsm_ros.instruments.scaling import AxisScaling
 from omsm_ros.instruments.six_channel.device import GenericStreamDevice, StreamSettings, samples_of
@@ -241,3 +245,24 @@ def test_one_that_is_gone_is_an_error() -> None:
 
     with pytest.raises(DeviceError, match="no route"):
         polled(Gone(), renew=10.0, seconds=35.0)
+
+
+def test_counts_agree_at_every_moment() -> None:
+    """Another thread asks for them while samples pass from the tracker to the blocks."""
+    script = Script(encode_frames(frames_of(np.arange(250))))
+    device = GenericStreamDevice(script, StreamSettings(pause=NEVER))
+    device.open()
+    found: list[dict[str, float]] = []
+    asker = threading.Thread(target=lambda: found.append(device.counts()))
+    cut = device._cutter.add
+
+    def slow(*arguments: Any, **options: Any) -> Iterator[BlockPair]:
+        if not asker.ident:
+            asker.start()
+            asker.join(0.05)
+        return cut(*arguments, **options)
+
+    device._cutter.add = slow  # type: ignore[method-assign]
+    device.poll(0.0)
+    asker.join()
+    assert (found[0]["decoded"], found[0]["delivered"], found[0]["pending"]) == (250, 200, 50)

@@ -224,8 +224,12 @@ def test_a_power_cycle_that_leaves_the_connection_open_is_noticed(bench: Any) ->
     assert run.device.statistics.restarts == 1
 
 
-def test_the_sample_time_is_set_and_what_it_becomes_is_checked() -> None:
+@pytest.mark.parametrize("end", ["", "\r", "\r\n"])
+def test_the_sample_time_is_set_and_what_it_becomes_is_checked(
+    end: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     emulator = with_commands.CapaNcdtEmulator
+    monkeypatch.setattr(emulator, "echoed_end", end)
     run = WithCommands(emulator, CapaNcdtDevice, CapaNcdtSettings(sample_period=500e-6))
     run.device.open()
     assert run.emulator.rate() == pytest.approx(2000)

@@ -67,13 +67,15 @@ class ConfocalDtEmulator(Controller, micro_epsilon.ConfocalDtEmulator):
 class CapaNcdtEmulator(Controller, micro_epsilon.CapaNcdtEmulator):
     """Rounds sample times; other commands are unknown."""
 
+    echoed_end = ""  # of a command; some controllers echo it before the answer
+
     def obey(self, line: str) -> str:
         if line == "$VER":
             return "$VERDT6230;V1.2a;8010074OK\r\n"
         if line.startswith("$STI") and line[4:].isdecimal():
             step = max(1, round(int(line[4:]) / SAMPLE_STEP_US)) * SAMPLE_STEP_US
             self._period = step * MICROSECOND_S
-            return f"{line},{step}OK\r\n"
+            return f"{line}{self.echoed_end},{step}OK\r\n"
         if line.startswith("$TRG"):
             return f"{line}OK\r\n"
         return f"{line}$UNKNOWN COMMAND\r\n"

@@ -6,6 +6,7 @@ forms are accepted.
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -128,18 +129,12 @@ class Chrocodile(StreamDevice):
         self._wanted = settings
         self._selection = self._signals = selection
         self._probe = settings.probe
-        self._identity: dict[str, str] = {}
         self._asked = 0.0
         self._answers = Patience(settings.patience)
         self._ever_set_up = False
         self._exposures = 1  # averaged into a sample by the device
         self._slowed_by_averaging = True
         self._unheard = False  # it answered, but sent no readable telegram
-
-    @property
-    def identity(self) -> dict[str, str]:
-        """Return identity and settings as the device reported them."""
-        return self._identity
 
     @property
     def settings(self) -> dict[str, object]:
@@ -243,11 +238,12 @@ class Chrocodile(StreamDevice):
     def _is_unchanged(self, before: dict[str, str]) -> bool:
         """Return whether the device was not restarted since the settings ``before`` were read.
 
-        A new client has ordered no signals, so an empty selection is no sign. Setting the trigger
-        again would reset the counter, and with it the pairing with another device.
+        A new client has ordered no signals: an empty selection or no answer is no sign. Setting
+        the trigger again would reset the counter, and with it the pairing with another device.
         """
-        if not self._selected():
-            return False
+        with suppress(DeviceTimeoutError):
+            if not self._selected():
+                return False
         for name in ("SHZ", "AVD"):
             found = self._try(name, QUERY).numbers
             if found and name in before and f"{found[0]:g}" != before[name].split()[0]:

@@ -80,7 +80,7 @@ class CapaNcdtDevice(BlockStreamDevice):
         identity = {"model": port.ask("$VER", "\r", rb"\$VER").strip()}
         wanted = self._wanted.sample_period / MICROSECOND_S
         said = port.ask(f"$STI{wanted:.0f}", "\r", rb"\$STI")
-        found = re.search(r"\$STI\d+,(\d+)\s*OK", said)
+        found = re.search(r"\$STI\d+\s*,(\d+)\s*OK", said)  # the end is echoed, too
         if found is None:
             raise DeviceError(
                 f"{self._transport.name} did not accept a sample time of {wanted:.0f} µs: "

@@ -95,12 +95,6 @@ class BlockStreamDevice(StreamDevice):
         self._latest: tuple[int, bytes] | None = None  # counter and frames
         self._commands, self._period, self._patience = commands, period, patience
         self._answers = Patience(patience)
-        self._identity: dict[str, str] = {}
-
-    @property
-    def identity(self) -> dict[str, str]:
-        """Return the identity that the controller reported."""
-        return self._identity
 
     def _prepare(self) -> None:
         super()._prepare()
@@ -335,9 +329,7 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
                 f"{self._transport.name} refused {wanted:.4g} kHz: {error[0]!r}; choose another"
             )
         said = port.ask("MEASRATE", "\n")
-        answered = [
-            float(number) for number in re.findall(r"\d+(?:\.\d*)?", said) if float(number) > 0
-        ]
+        answered = [n for n in map(float, re.findall(r"\d+(?:\.\d*)?", said)) if n > 0]
         if not answered:
             raise DeviceError(
                 f"{self._transport.name} did not report its measuring rate ({said[-64:]!r}); check "
