@@ -223,8 +223,7 @@ def test_a_dropped_connection_keeps_the_count_of_triggers(kind: type[Device], em
     device = kind(empty=empty)
     driver = connected(device)
     before = blocks_for(driver, device, 1.0)
-    zero = device.zero
-    device.up = False
+    zero, device.up = device.zero, False
     with pytest.raises(DeviceError):
         driver.poll(0.05)
     before += driver.close()
