@@ -256,14 +256,14 @@ class SequenceTracker:
     def _counter_jumps(self, sample: np.void) -> bool:
         if self._counting.checked or not self._begun or self._anew:
             return False
-        return self._step(int(sample["counter"])) > 1 and not self._is_repeated(sample)
+        return self._step(int(sample["counter"])) != 1 and not self._is_repeated(sample)
 
     def _is_corrupted_counter(self, samples: Samples) -> bool:
-        """Return whether the counter jumps ahead at the first sample and is back at the next."""
+        """Return whether the counter jumps or stops at the first sample and is back at the next."""
         if len(samples) < 2 or not self._counter_jumps(samples[0]):
             return False
         here, after = (self._step(int(counter)) for counter in samples["counter"][:2])
-        return after <= here
+        return after <= here if here else after == 2
 
     def _step(self, raw: int) -> int:
         return (raw - self._raw) % self._counting.modulus

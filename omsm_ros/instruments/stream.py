@@ -152,7 +152,9 @@ class StreamDevice:
 
     def close(self) -> list[BlockPair]:
         """Disconnect and hand over the partial block, if any."""
+        off = self._cutter.lost_settings
         blocks = self._end(self._now_ns())
+        self._cutter.lost_settings = off  # what waited was measured before
         self._transport.close()
         return blocks
 

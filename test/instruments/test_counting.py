@@ -68,6 +68,19 @@ def test_a_counter_that_leaps_and_comes_back_is_spoilt(place: int, wrong: int) -
         assert (tracker.spoilt, tracker.lost, tracker.restarts) == (1, 1, 0)
 
 
+@pytest.mark.parametrize("bit", [0, 3, 9, 15])
+@pytest.mark.parametrize("place", [150, 151, 154])
+@pytest.mark.parametrize("timed", [True, False])
+def test_a_flipped_bit_of_a_counter_costs_its_own_sample(place: int, bit: int, timed: bool) -> None:
+    """The number may become that of the sample before or after."""
+    spoilt = samples(list(range(100, 400)))
+    spoilt["time"] = np.arange(300) * 1_000_000
+    spoilt["counter"][place] ^= 1 << bit
+    tracker = SequenceTracker(Counting(2**16, timed=timed, checked=False))
+    assert numbers(tracker, spoilt) == [n for n in range(100, 400) if n != 100 + place]
+    assert (tracker.restarts, tracker.spoilt, tracker.lost) == (0, 1, 1)
+
+
 def test_a_leap_is_held_until_the_next_sample_tells() -> None:
     tracker = SequenceTracker(FREE)
     assert numbers(tracker, samples([1, 2])) == [1, 2]
