@@ -73,7 +73,8 @@ class DeviceReader:
         try:
             return done.result(patience)
         except TimeoutError as err:
-            done.cancel()
+            if not done.cancel() and done.done():
+                raise  # the device did not answer
             raise DeviceError(f"the device did not do it within {patience:g} s") from err
 
     def _do_requests(self) -> None:

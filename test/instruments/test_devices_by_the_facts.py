@@ -266,6 +266,9 @@ def test_a_dark_reference_is_taken_or_refused(kind: type[Device]) -> None:
     driver = connected(device)
     assert driver.dark_reference() == "12.5"
     assert driver.identity["stray_light"] == "12.5"
+    device.dark = "lamp"
+    with pytest.raises(RefusedError, match="lamp"):
+        driver.dark_reference()
     device.refused.add("DRK")
     with pytest.raises(RefusedError):
         driver.dark_reference()

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from omsm_ros.errors import DeviceError, NoSamplesError
+from omsm_ros.errors import DeviceError, DeviceTimeoutError, NoSamplesError
 from omsm_ros.instruments.blocks import BlockPair
 from omsm_ros.instruments.reader import DeviceReader, State
 
@@ -158,8 +158,13 @@ def test_a_request_is_done_by_the_reading_thread() -> None:
     def refuse() -> None:
         raise DeviceError("the target is in range")
 
+    def silent() -> None:
+        raise DeviceTimeoutError("no answer to DRK")
+
     with pytest.raises(DeviceError, match="in range"):
         reader.ask(refuse, 5.0)
+    with pytest.raises(DeviceError, match="no answer to DRK"):
+        reader.ask(silent, 5.0)
     assert reader.state is State.READING
     stop.set()
     thread.join()

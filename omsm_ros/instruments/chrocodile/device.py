@@ -167,8 +167,10 @@ class Chrocodile(StreamDevice):
 
         Return the stray light as the device states it; empty if it does not. Raises DeviceError.
         """
-        numbers = self._ask("DRK", patience=self._wanted.patience + 8.0).numbers
-        light = f"{numbers[-1]:g}" if numbers else ""
+        answer = self._ask("DRK", patience=self._wanted.patience + 8.0)
+        if not answer.numbers and answer.text.strip(" $DRK\r\n"):
+            raise RefusedError(f"{self._transport.name} took no dark reference: {answer.text!r}")
+        light = f"{answer.numbers[-1]:g}" if answer.numbers else ""
         self._identity["stray_light"] = light or "not reported"
         return light
 
