@@ -104,7 +104,8 @@ def parameter_covariance(
     walk = 0.0
     if walks:
         likelihood = RandomWalk.of(problem, orthonormal(columns, _RANK_TOLERANCE))
-        walk = likelihood.variance_if_shown(problem.on_grid(residual, 0.0))
+        left = problem.on_grid(residual, 0.0)
+        walk = likelihood.variance(left, on_grid[:0])[0] if likelihood.shows(left) else 0.0
     missed = problem.on_grid(residual, np.nan)
     for part in problem.recordings:
         # Each recording has noise of its own.

@@ -430,11 +430,6 @@ class RandomWalk:
         likelihood, *_ = self._likelihood(residual, np.empty((0, len(residual))))
         return bool(2 * np.max(likelihood - likelihood[0]) > np.log(len(self.ratios)))
 
-    def variance_if_shown(self, residual: FloatArray) -> float:
-        """Return the variance per sample of the walk's increments, 0 where none shows."""
-        none = np.empty((0, len(residual)))
-        return self.variance(residual, none)[0] if self.shows(residual) else 0.0
-
     def variance(self, residual: FloatArray, rows: FloatArray) -> tuple[float, float]:
         """Return the variance per sample of the walk's increments, and χ² of ``rows`` (c, n).
 
