@@ -158,8 +158,6 @@ def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsPr
 
 def _thinned(record: SampledRecord, every: int) -> SampledRecord:
     """Return one in ``every`` samples, behind a low pass."""
-    if every == 1:
-        return record
     inputs, output = (
         np.asarray(signal.resample_poly(values, 1, every, axis=0, padtype="line"))
         for values in (record.inputs, record.filled())
@@ -283,12 +281,12 @@ def _confirmed(problem: SectionsProblem, order: int) -> SectionsProblem:
 def _explore(
     early: SectionsProblem, whole: SectionsProblem, most: int, asked: int, lag: SectionsFit
 ) -> tuple[list[SectionsFit], FloatArray]:
-    """Return fits of rising order to ``early``, and what they explain of the rest of ``whole``.
+    """Return fits of rising order to ``early``, and what they miss of the rest of ``whole``.
 
     They end where orders stop to improve the prediction, at ``asked`` or beyond.
     """
     fits: list[SectionsFit] = []
-    explained: list[float] = []
+    missed: list[float] = []
     best = 0
     late = lag.problem.late(lag.nonlinear, lag.order)
     for order in sorted(n for n in {*_ORDERS, asked} if n <= most):
@@ -296,12 +294,12 @@ def _explore(
         raced = [early.fit(order, [start], _RACE) for start in starts]
         chosen = min(raced, key=lambda one: _missed(one, whole))
         fits.append(early.fit(order, [chosen.nonlinear], _EXPLORING))
-        explained.append(1 - _missed(fits[-1], whole))
-        if explained[-1] > 1 - _NO_GAIN * (1 - explained[best]):
-            best = len(explained) - 1
-        if len(explained) - 1 - best >= _FRUITLESS and order >= asked:
+        missed.append(_missed(fits[-1], whole))
+        if missed[-1] < _NO_GAIN * missed[best]:
+            best = len(missed) - 1
+        if len(missed) - 1 - best >= _FRUITLESS and order >= asked:
             break
-    return fits, np.nan_to_num(np.array(explained), nan=-np.inf)
+    return fits, np.array(missed)
 
 
 def _starts(
@@ -343,8 +341,7 @@ def _missed(fitted: SectionsFit, whole: SectionsProblem) -> float:
         return float(np.mean(np.nan_to_num(every**2, nan=np.inf))) if len(every) else np.inf
 
 
-def _finalists(orders: Sequence[int], explained: FloatArray, asked: int) -> list[int]:
-    missed = 1 - explained
+def _finalists(orders: Sequence[int], missed: FloatArray, asked: int) -> list[int]:
     best = np.argsort(missed, kind="stable")[:_FINALISTS]
     alike = np.flatnonzero(missed <= _EQUIVALENT * np.min(missed))[:_FINALISTS]
     return sorted({0, 1, asked, *(orders[i] for i in (*best, *alike))} & {*orders})

@@ -170,8 +170,8 @@ def _inflated_to_free_choice(
     return replace(sections, covariance=factor**2 * np.asarray(sections.covariance)), factor
 
 
-def _narrow(band: Band) -> BoolArray:
-    return np.asarray(COVERAGE_FACTOR * np.maximum(band.gain, band.phase) <= _LIMIT)
+def _narrow(band: Band, apart: FloatArray | float = 0.0) -> BoolArray:
+    return np.asarray(COVERAGE_FACTOR * np.maximum(band.gain, band.phase) + apart <= _LIMIT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,11 +179,13 @@ class _Block:
     """Neighbouring lines, and the response of the residual to each input there.
 
     frequency: lowest and highest at which they have power [Hz]
+    size: of the response of the model, rms over the power of the lines, (m,)
     difference, uncertainty: of the response from the model, relative to that, (m,)
     off: share of lines that differ beyond limit and noise, (m,); NaN where none shows the noise
     """
 
     frequency: tuple[float, float]
+    size: FloatArray
     difference: FloatArray
     uncertainty: FloatArray
     off: FloatArray
@@ -202,17 +204,20 @@ def _blocks(candidate: SampledCandidate, period: float) -> list[_Block]:
         spectra = np.asarray(np.fft.rfft(centred, axis=0).T, np.complex128)
         frequency = np.asarray(np.fft.rfftfreq(len(record)), np.float64)
         driven = np.asarray(spectra * model.response(frequency))
-        power = np.sum(np.abs(spectra) ** 2, axis=0)
-        power[0] = 0.0
+        powers = np.abs(spectra) ** 2
+        powers[:, 0] = 0.0
+        power = np.sum(powers, axis=0)
         nearby = ndimage.maximum_filter1d(power, _LINES)
         excited = (power > _NEARBY * nearby) & (power > _LEAST_POWER * power.max())
-        power *= excited
+        powers *= excited
         # Lines near an excited one show the noise.
         lines = np.flatnonzero(ndimage.binary_dilation(excited, iterations=_LINES // 2))
         residual = np.asarray(np.fft.rfft(grid), np.complex128)
         for part in _neighbours(lines, _LINES + _LINES_PER_INPUT * len(spectra)):
             found.append(
-                _compared(frequency[part] / period, driven[:, part], residual[part], power[part])
+                _compared(
+                    frequency[part] / period, driven[:, part], residual[part], powers[:, part]
+                )
             )
     return sorted(found, key=lambda block: block.frequency)
 
@@ -231,9 +236,11 @@ def _neighbours(lines: IntArray, size: int) -> list[IntArray]:
 
 
 def _compared(
-    frequency: FloatArray, driven: ComplexArray, residual: ComplexArray, power: FloatArray
+    frequency: FloatArray, driven: ComplexArray, residual: ComplexArray, powers: FloatArray
 ) -> _Block:
     """Fit the residual of one block by the responses ``driven`` (m, k) and a transient.
+
+    powers: of the inputs, (m, k), 0 where they are not excited
 
     Beyond the noise of lines that are not excited, the residual of each other one is distortion, or
     dynamics narrower than the block. It may be of all inputs: each is taken to differ least.
@@ -249,7 +256,7 @@ def _compared(
     spread = np.sqrt(variance * np.sum(np.abs(inverse) ** 2, axis=1)) / scale
     if np.linalg.matrix_rank(columns, tol=_COLLINEAR) < columns.shape[1]:
         spread[:] = np.inf
-    inputs = len(driven)
+    inputs, power = len(driven), np.sum(powers, axis=0)
     strong = frequency[power > _STRONG * np.max(power)]
     ends = float(strong[0]), float(strong[-1])
     off, apart, quiet = np.full(inputs, np.nan), np.abs(residual), power == 0
@@ -257,7 +264,8 @@ def _compared(
         beyond = np.abs(driven) * apart > _LIMIT * np.sum(np.abs(driven) ** 2, axis=0)
         beyond &= apart > _SIGNIFICANT * np.sqrt(np.mean(apart[quiet] ** 2))
         off = np.mean(beyond[:, ~quiet], axis=1)
-    return _Block(ends, np.abs(solved / scale)[:inputs], spread[:inputs], off)
+    size = scale[:inputs] / np.sqrt(np.maximum(np.sum(powers, axis=1), np.finfo(float).tiny))
+    return _Block(ends, size, np.abs(solved / scale)[:inputs], spread[:inputs], off)
 
 
 def valid_range(
@@ -269,13 +277,11 @@ def valid_range(
 ) -> tuple[float, float]:
     """Return the widest range [Hz], in octaves, that the data support for one input.
 
-    others: responses (a, k) of models that predict about as well, and without a model; where they
-        differ, the model is not known unless the data show it
+    others: responses (a, k) of models that predict about as well, and without a model; the largest
+        difference adds to the uncertainty of the model
     Both ends are the lowest of ``frequency`` if there is no such range.
     """
-    if not blocks:
-        return float(frequency[0]), float(frequency[0])
-    lowest, highest = np.array([block.frequency for block in blocks]).T
+    lowest, highest = np.reshape([block.frequency for block in blocks], (-1, 2)).T
     difference = np.array([block.difference[input] for block in blocks])
     spread = np.array([block.uncertainty[input] for block in blocks])
     lines, near_ratio = frequency[:, np.newaxis], 2**_NEAR_OCTAVES
@@ -286,17 +292,21 @@ def valid_range(
     differs = lined @ np.nan_to_num(off) > _MAY_DIFFER * np.sum(lined, axis=1)
     # One difference over a wide block does not show modes inside it.
     close = near * (highest <= _BLOCK_RATIO * lowest)
-    within = difference + COVERAGE_FACTOR * spread <= _LIMIT
-    agrees = (close @ within > 0) & (close @ ~within <= _MAY_DIFFER * np.sum(close, axis=1))
+    # It is that of the stronger lines, and as large in a zero among them.
+    response = sections.response(frequency)[input]
+    level = np.array([block.size[input] for block in blocks]) / np.abs(response)[:, np.newaxis]
+    within = np.maximum(level, 1.0) * (difference + COVERAGE_FACTOR * spread) <= _LIMIT
+    agrees = np.any(close * within, axis=1)
+    agrees &= np.sum(close * ~within, axis=1) <= _MAY_DIFFER * np.sum(close, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         shown = near @ (1 / spread**2) >= (COVERAGE_FACTOR / _LIMIT) ** 2
-        alike = np.all(np.abs(others / sections.response(frequency)[input] - 1) <= _LIMIT, axis=0)
+        apart = np.max(np.abs(others / response - 1), axis=0, initial=0.0)
         excess = near @ np.nan_to_num((difference / spread) ** 2)
     excited = np.logical_or.accumulate(shown) & np.logical_or.accumulate(shown[::-1])[::-1]
     # The narrow band of a model of too few poles is contradicted by differences beyond chance.
     upheld = special.gammaincc(count, excess) > np.exp(-(_SIGNIFICANT**2))
-    upheld |= near @ ~within <= _MAY_DIFFER * count
-    inside = (_narrow(sections.band(frequency, input)) & alike & upheld) | agrees
+    upheld |= np.sum(near * ~within, axis=1) <= _MAY_DIFFER * count
+    inside = (_narrow(sections.band(frequency, input), apart) & upheld) | agrees
     return _widest(frequency, inside & excited & ~differs)
 
 

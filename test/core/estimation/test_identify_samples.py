@@ -287,15 +287,20 @@ def test_a_model_is_valid_between_the_frequencies_of_the_input():
 
 
 @pytest.mark.parametrize(
-    ("different", "ratio", "valid"), [(1, 1.1, True), (3, 1.1, False), (0, 2.0, False)]
+    ("different", "ratio", "size", "valid"),
+    [(1, 1.1, 0.1, True), (3, 1.1, 0.1, False), (0, 2.0, 0.1, False), (0, 1.1, 10, False)],
 )
-def test_most_narrow_blocks_must_agree_where_the_model_is_uncertain(different, ratio, valid):
-    """Twenty blocks within a sixth of an octave; a wide one may hide a mode."""
+def test_most_narrow_blocks_must_agree_where_the_model_is_uncertain(different, ratio, size, valid):
+    """Twenty blocks within a sixth of an octave; a wide one may hide a mode.
+
+    What is known of a response ten times as large is not known in a zero beside it.
+    """
     sections = from_polynomials("zero-order", PERIOD, *polynomials("zero-order"), 0)
     known = np.full(1, 0.01)
     blocks = [
         SimpleNamespace(
             frequency=(0.5, 0.5 * ratio),
+            size=size * np.abs(sections.response(np.array([0.5]))[0]),
             difference=np.full(1, 0.3 * (k < different)),
             uncertainty=known,
             off=np.full(1, np.nan),
@@ -327,6 +332,7 @@ def test_a_narrow_band_of_the_model_counts_where_nothing_contradicts_it(
     blocks = [
         SimpleNamespace(
             frequency=(0.4, 0.6),
+            size=np.zeros(1),
             difference=np.full(1, difference),
             uncertainty=np.full(1, spread),
             off=np.full(1, off),
@@ -337,6 +343,26 @@ def test_a_narrow_band_of_the_model_counts_where_nothing_contradicts_it(
     none = np.zeros((0, len(lines)), complex)
     low, high = valid_range(sections, blocks, lines, 0, none)
     assert (low < 0.5 < high) if valid else low == high
+
+
+@pytest.mark.parametrize(("apart", "valid"), [(0.02, True), (0.05, False)])
+def test_the_difference_of_another_model_adds_to_the_uncertainty(apart, valid):
+    sections = from_polynomials("zero-order", PERIOD, *polynomials("zero-order"), 0)
+    sections = replace(sections, covariance=np.eye(2 + 4 * len(sections.denominators)))
+    lines = np.array([0.5, 0.51])
+    band = sections.band(lines)
+    unit = (0.035 / np.max([band.gain, band.phase])) ** 2
+    sections = replace(sections, covariance=unit * np.asarray(sections.covariance))
+    block = SimpleNamespace(
+        frequency=(0.4, 0.7),
+        size=np.zeros(1),
+        difference=np.zeros(1),
+        uncertainty=np.full(1, 0.01),
+        off=np.full(1, np.nan),
+    )
+    other = (1 + apart) * sections.response(lines)
+    low, high = valid_range(sections, [block], lines, 0, other)
+    assert (low < high) == valid
 
 
 def test_distortion_of_lines_is_separated_from_noise_by_those_between(monkeypatch):
