@@ -302,6 +302,7 @@ def valid_range(
         shown = near @ (1 / spread**2) >= (COVERAGE_FACTOR / _LIMIT) ** 2
         apart = np.max(np.abs(others / response - 1), axis=0, initial=0.0)
         excess = near @ np.nan_to_num((difference / spread) ** 2)
+    shown &= np.any(lines >= lowest, axis=1) & np.any(lines <= highest, axis=1)
     excited = np.logical_or.accumulate(shown) & np.logical_or.accumulate(shown[::-1])[::-1]
     # The narrow band of a model of too few poles is contradicted by differences beyond chance.
     upheld = special.gammaincc(count, excess) > np.exp(-(_SIGNIFICANT**2))
