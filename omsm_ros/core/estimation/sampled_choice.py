@@ -234,8 +234,7 @@ def _with_delays(problem: SectionsProblem, most: int) -> tuple[SectionsProblem, 
     for input in range(problem.inputs):
         tried = range(1, most + 1) if problem.hold != BAND_LIMITED else _FREE_DELAYS[1:]
         for delay in tried:
-            late = delays.copy()
-            late[input] = delay
+            late = np.where(np.arange(len(delays)) == input, delay, delays)
             found = _late(problem, late, _DELAY_ORDER)
             if _better(found, best):
                 best = found

@@ -161,11 +161,10 @@ def _inflated_to_free_choice(
     free, factor = _sections(choice.free, sections.period), 1.0
     with np.errstate(divide="ignore", invalid="ignore"):
         apart = np.log(free.response(lines) / sections.response(lines))
-    for input in range(sections.inputs):
-        low, high = _widest(lines, _narrow(sections.band(lines, input)))
-        trusted = (lines >= low) & (lines <= high) & np.isfinite(apart[input])
-        own, other = (each.band(lines[trusted], input) for each in (sections, free))
-        with np.errstate(divide="ignore"):
+        for input in range(sections.inputs):
+            low, high = _widest(lines, _narrow(sections.band(lines, input)))
+            trusted = (lines >= low) & (lines <= high) & np.isfinite(apart[input])
+            own, other = (each.band(lines[trusted], input) for each in (sections, free))
             factor = max(factor, widening(own, other, apart[input][trusted]))
     return replace(sections, covariance=factor**2 * np.asarray(sections.covariance)), factor
 
@@ -226,9 +225,8 @@ def _neighbours(lines: IntArray, size: int) -> list[IntArray]:
     """Return ``lines`` in blocks of ``size``; none spans more than a ratio of frequencies."""
     blocks, place = [], 0
     while place < len(lines):
-        end = min(place + size, len(lines))
-        far = np.searchsorted(lines, _BLOCK_RATIO * lines[place] + size / 2)
-        end = max(min(end, int(far)), place + 1)
+        far = int(np.searchsorted(lines, _BLOCK_RATIO * lines[place] + size / 2))
+        end = max(min(place + size, far), place + 1)
         if 2 * (end - place) >= size:
             blocks.append(lines[place:end])
         place = end
@@ -313,9 +311,7 @@ def valid_range(
 
 def _widest(frequency: FloatArray, inside: BoolArray) -> tuple[float, float]:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(np.int8), [0]])))
-    if not len(edges):
-        return float(frequency[0]), float(frequency[0])
-    starts, stops = edges[::2], edges[1::2] - 1
+    starts, stops = np.append(edges[::2], 0), np.append(edges[1::2] - 1, 0)
     widest = int(np.argmax(frequency[stops] / frequency[starts]))
     return float(frequency[starts[widest]]), float(frequency[stops[widest]])
 

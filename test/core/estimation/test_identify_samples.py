@@ -299,7 +299,7 @@ def test_most_narrow_blocks_must_agree_where_the_model_is_uncertain(different, r
     known = np.full(1, 0.01)
     blocks = [
         SimpleNamespace(
-            frequency=(0.5, 0.5 * ratio),
+            frequency=(0.49, 0.49 * ratio),
             size=size * np.abs(sections.response(np.array([0.5]))[0]),
             difference=np.full(1, 0.3 * (k < different)),
             uncertainty=known,
