@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +23,6 @@ from omsm_ros.core.identification import sampled_identification
 from omsm_ros.core.identification.sampled_identification import (
     identify_samples,
     sampled_certificate,
-    valid_range,
 )
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import ConfigurationError, IdentificationError
@@ -284,85 +282,6 @@ def test_a_model_is_valid_between_the_frequencies_of_the_input():
     # A third of an octave around a line counts as excited.
     assert 5 / 1.3 < low < 5.3
     assert 57 < high < 60 * 1.3
-
-
-@pytest.mark.parametrize(
-    ("different", "ratio", "size", "valid"),
-    [(1, 1.1, 0.1, True), (3, 1.1, 0.1, False), (0, 2.0, 0.1, False), (0, 1.1, 10, False)],
-)
-def test_most_narrow_blocks_must_agree_where_the_model_is_uncertain(different, ratio, size, valid):
-    """Twenty blocks within a sixth of an octave; a wide one may hide a mode.
-
-    What is known of a response ten times as large is not known in a zero beside it.
-    """
-    sections = from_polynomials("zero-order", PERIOD, *polynomials("zero-order"), 0)
-    known = np.full(1, 0.01)
-    blocks = [
-        SimpleNamespace(
-            frequency=(0.49, 0.49 * ratio),
-            size=size * np.abs(sections.response(np.array([0.5]))[0]),
-            difference=np.full(1, 0.3 * (k < different)),
-            uncertainty=known,
-            off=np.full(1, np.nan),
-        )
-        for k in range(20)
-    ]
-    lines = np.geomspace(0.05, 10, 400)
-    none = np.zeros((0, len(lines)), complex)
-    low, high = valid_range(sections, blocks, lines, 0, none)
-    assert (low < 0.5 < high) if valid else low == high
-
-
-@pytest.mark.parametrize(
-    ("difference", "spread", "off", "valid"),
-    [
-        (0.0, 0.01, 0.05, True),
-        (0.0, 0.01, 0.2, False),  # distortion of single lines
-        (0.09, 0.06, np.nan, True),  # chance, in each of two blocks
-        (0.14, 0.05, np.nan, False),  # none is beyond chance, but both together are
-        (0.02, 1e-4, np.nan, True),  # beyond chance, but within the limit
-    ],
-)
-def test_a_narrow_band_of_the_model_counts_where_nothing_contradicts_it(
-    difference, spread, off, valid
-):
-    sections = from_polynomials("zero-order", PERIOD, *polynomials("zero-order"), 0)
-    size = 2 + 4 * len(sections.denominators)
-    sections = replace(sections, covariance=1e-20 * np.eye(size))
-    blocks = [
-        SimpleNamespace(
-            frequency=(0.4, 0.6),
-            size=np.zeros(1),
-            difference=np.full(1, difference),
-            uncertainty=np.full(1, spread),
-            off=np.full(1, off),
-        )
-        for _ in range(2)
-    ]
-    lines = np.geomspace(0.05, 10, 400)
-    none = np.zeros((0, len(lines)), complex)
-    low, high = valid_range(sections, blocks, lines, 0, none)
-    assert (low < 0.5 < high) if valid else low == high
-
-
-@pytest.mark.parametrize(("apart", "valid"), [(0.02, True), (0.05, False)])
-def test_the_difference_of_another_model_adds_to_the_uncertainty(apart, valid):
-    sections = from_polynomials("zero-order", PERIOD, *polynomials("zero-order"), 0)
-    sections = replace(sections, covariance=np.eye(2 + 4 * len(sections.denominators)))
-    lines = np.array([0.5, 0.51])
-    band = sections.band(lines)
-    unit = (0.035 / np.max([band.gain, band.phase])) ** 2
-    sections = replace(sections, covariance=unit * np.asarray(sections.covariance))
-    block = SimpleNamespace(
-        frequency=(0.4, 0.7),
-        size=np.zeros(1),
-        difference=np.zeros(1),
-        uncertainty=np.full(1, 0.01),
-        off=np.full(1, np.nan),
-    )
-    other = (1 + apart) * sections.response(lines)
-    low, high = valid_range(sections, [block], lines, 0, other)
-    assert (low < high) == valid
 
 
 def test_distortion_of_lines_is_separated_from_noise_by_those_between(monkeypatch):

@@ -1,0 +1,83 @@
+"""Test the range in which a sampled model is valid, from blocks of lines."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from sections_of_polynomials import from_polynomials
+
+from omsm_ros.core.identification.sampled_identification import valid_range
+
+LINES = np.geomspace(0.05, 10, 400)
+
+
+def known(standard):
+    """A model of a band of ``standard`` at 0.5 Hz."""
+    sections = from_polynomials(
+        "zero-order", 0.05, np.array([0.0, 0.1, 0.1]), np.array([1.0, -1.5, 0.7]), 0
+    )
+    every = replace(sections, covariance=np.eye(2 + 4 * len(sections.denominators)))
+    band = every.band(np.array([0.5]))
+    factor = standard / np.max([band.gain, band.phase])
+    return replace(sections, covariance=factor**2 * np.asarray(every.covariance))
+
+
+def block(low, high, difference, uncertainty=0.01, off=np.nan, size=0.0):
+    arrays = (np.full(1, value) for value in (size, difference, uncertainty, off))
+    names = ("size", "difference", "uncertainty", "off")
+    return SimpleNamespace(frequency=(low, high), **dict(zip(names, arrays, strict=True)))
+
+
+def validated(sections, blocks, apart=()):
+    """Return whether the model is valid at 0.5 Hz, another one being off by a share ``apart``."""
+    others = [(1 + a) * sections.response(LINES)[0] for a in apart]
+    low, high = valid_range(sections, blocks, LINES, 0, np.reshape(others, (-1, len(LINES))))
+    return low < 0.5 < high
+
+
+@pytest.mark.parametrize(
+    ("different", "ratio", "size", "valid"),
+    [(1, 1.1, 0.1, True), (3, 1.1, 0.1, False), (0, 2.0, 0.1, False), (0, 1.1, 10, False)],
+)
+def test_most_narrow_blocks_must_agree_where_the_model_is_uncertain(different, ratio, size, valid):
+    """Twenty blocks within a sixth of an octave; a wide one may hide a mode.
+
+    What is known of a response ten times as large is not known in a zero beside it.
+    """
+    sections = known(0.2)
+    size = size * np.abs(sections.response(np.array([0.5]))[0, 0])
+    blocks = [block(0.49, 0.49 * ratio, 0.3 * (k < different), size=size) for k in range(20)]
+    assert validated(sections, blocks) == valid
+
+
+@pytest.mark.parametrize(
+    ("difference", "spread", "off", "valid"),
+    [
+        (0.0, 0.01, 0.05, True),
+        (0.0, 0.01, 0.2, False),  # distortion of single lines
+        (0.09, 0.06, np.nan, True),  # chance, in each of two blocks
+        (0.14, 0.05, np.nan, False),  # none is beyond chance, but both together are
+        (0.02, 1e-4, np.nan, True),  # beyond chance, but within the limit
+    ],
+)
+def test_a_narrow_band_of_the_model_counts_where_nothing_contradicts_it(
+    difference, spread, off, valid
+):
+    blocks = [block(0.4, 0.6, difference, spread, off)] * 2
+    assert validated(known(1e-10), blocks) == valid
+
+
+@pytest.mark.parametrize(("apart", "valid"), [(0.02, True), (0.05, False)])
+def test_the_difference_of_another_model_adds_to_the_uncertainty(apart, valid):
+    assert validated(known(0.035), [block(0.4, 0.7, 0.0)], [apart]) == valid
+
+
+def test_nothing_is_known_without_lines():
+    assert not validated(known(1e-10), [])
+
+
+def test_the_range_ends_with_the_lines_of_the_input():
+    low, high = valid_range(known(1e-10), [block(0.4, 0.6, 0.0)], LINES, 0, np.zeros((0, 400)))
+    assert 0.4 <= low < 0.42
+    assert 0.58 < high <= 0.6
