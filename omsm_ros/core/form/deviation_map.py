@@ -88,7 +88,8 @@ def neighbour_noise(x: FloatArray, y: FloatArray, deviation: FloatArray) -> floa
         return noise_of(deviation)
     some = slice(None, None, -(-len(x) // _MOST_PREDICTED))
     places = np.column_stack([x, y])
-    near = cKDTree(places).query(places[some], _NEIGHBOURS + 1)[1][:, 1:]
+    tree = cKDTree(places, balanced_tree=False, compact_nodes=False)  # for few places
+    near = tree.query(places[some], _NEIGHBOURS + 1)[1][:, 1:]
     away = places[near] - places[some, np.newaxis]
     size = np.max(np.abs(away), axis=(1, 2), keepdims=True)
     away /= np.where(size > 0, size, 1.0)

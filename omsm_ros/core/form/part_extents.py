@@ -47,8 +47,11 @@ _CONDITION = 1e7
 _MOST_FITTED, _MOST_DRAWN = 20_000, 2_000
 # 200 draws give a standard deviation to 5 %.
 _DRAWS, _SEED = 200, 7
-# Cells that show local features, in mean distances of the points, and points at either extreme.
-_CELLS, _HALF = (8.0, 4.0, 2.0, 1.0, 0.5), 500
+# Halvings of the cells that show local features, and points at either extreme.
+_HALVINGS, _HALF = 4, 500
+# The grid of cells may divide a feature. On one of three grids a third of a cell apart, any lies
+# within a cell of a few times its size.
+_SHIFTS = (0.0, 1 / 3, 2 / 3)
 # Standard deviations of χ² that chance does not exceed.
 _CHANCE = 3.0
 # Least variance, so that a part without noise keeps all terms [m²].
@@ -104,6 +107,7 @@ class _PartForm(NamedTuple):
     noise: of the deviation [m]
     local: points that differ from the smooth form (m,);  blurred: rms of the form lost [m]
     texture: height of waves that the scatter about the value shows, but no mean (n,) [m]
+    hidden: how far other grids of cells show the form below and above the value (2, n) [m]
     """
 
     value: FloatArray
@@ -117,13 +121,14 @@ class _PartForm(NamedTuple):
     local: IntArray
     blurred: float
     texture: FloatArray
+    hidden: FloatArray
 
     @classmethod
     def of(cls, map_: DeviationMap, disc: Aperture) -> _PartForm:
         """Return the form of a map;  disc: of the smooth terms."""
         fit = _smooth(map_.every(_MOST_FITTED), disc)
         mean, cell = fit.height(map_.x, map_.y), np.arange(len(map_))
-        local, form, own, noise = _local_features(map_, mean)
+        (local, form, own, noise), *others = (_local_features(map_, mean, k) for k in _SHIFTS)
         left = map_.deviation - mean
         # Wiener's factor, and the rms of the form lost by it.
         more = max(float(np.mean(left**2)) - map_.noise**2, 0.0)
@@ -132,9 +137,13 @@ class _PartForm(NamedTuple):
         value[local], error[local], cell[local] = form, noise, len(map_) + own
         above = value - mean
         mean[local], blurred = form, (1 - share) * float(np.sqrt(more))
-        left = map_.deviation - value
+        left, hidden = map_.deviation - value, np.zeros((2, len(map_)))
+        for at, other, *_ in others:
+            hidden[:, at] = np.maximum(hidden[:, at], np.outer((-1, 1), other - value[at]))
         texture = _texture(map_, left)
-        return cls(value, fit, cell, error, mean, left, above, map_.noise, local, blurred, texture)
+        return cls(
+            value, fit, cell, error, mean, left, above, map_.noise, local, blurred, texture, hidden
+        )
 
     def extents(
         self, map_: DeviationMap, shift: FloatArray, gaps: _Gaps | None
@@ -183,6 +192,8 @@ class _PartForm(NamedTuple):
 
 def _extents(values: FloatArray, ends: tuple[float, float]) -> FloatArray:
     """Return the distances between the quantiles ``ends`` along the first axis."""
+    if ends == (0.0, 1.0):
+        return np.asarray(np.ptp(values, axis=0))
     return np.asarray(np.ptp(np.quantile(values, ends, axis=0, method="hazen"), axis=0))
 
 
@@ -246,10 +257,10 @@ class _Gaps(NamedTuple):
         rim, further = np.sum(self.weights * form[self.near], axis=2)
         weights, found = np.sum(self.weights, axis=0), []
         chance = 2 * np.sqrt(np.sum((weights * part.error[self.near]) ** 2, axis=1))
-        for sign in (-1, 1):
+        for sign, hidden in zip((-1, 1), part.hidden, strict=True):
             values = sign * form
             at_rim = float(np.max(sign * (rim + further) - chance, initial=-np.inf))
-            summit = self._summit(values, sign * part.above, part.error)
+            summit = self._summit(values + hidden, sign * part.above + hidden, part.error)
             found.append(max(summit, at_rim) - float(values.max()))
         # The points stand for the way to the rim; along it the form changes by half on average.
         more = float(self.share @ (rim**2 - form[self.near[:, 0]] ** 2)) / 4
@@ -324,29 +335,27 @@ def _continued(x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _local_features(
-    map_: DeviationMap, smooth: FloatArray
+    map_: DeviationMap, smooth: FloatArray, shift: float
 ) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
     """Return where (m,) grooves, pips, scratches and edges change the ``smooth`` form (n,) [m].
 
     Also the form there [m], the number of the cell whose mean it is, and the noise of that mean
-    [m], each (m,).
+    [m], each (m,).  shift: of the grid of cells in the largest of them
 
     Cells of five sizes whose mean exceeds what noise makes anywhere on the map show them, as do
     single points (D. Donoho, I. Johnstone, Biometrika 81, 425). Each of the largest cells with one
     has the means of the sizes with the least expected error (Stein); all cells have, if the means
     of one size are closer than none all over the map, as for ripple.
     """
-    rest = map_.deviation - smooth
-    levels, differs = [], np.abs(rest) > _beyond_chance(len(map_)) * map_.noise
-    ripple = False
-    for pitch in _CELLS:
-        levels.append(_cells(map_, pitch))
-        mean, error = _cell_means(levels[-1], rest, map_.noise)
-        count = int(np.sum(error > 0))
-        differs |= (np.abs(mean) > _beyond_chance(count) * error)[levels[-1]]
+    rest, levels, ripple = map_.deviation - smooth, _cells(map_, shift), False
+    differs = np.abs(rest) > _beyond_chance(len(map_)) * map_.noise
+    for cell in levels:
+        mean, error = _cell_means(cell, rest, map_.noise)
+        count, ratio = int(np.count_nonzero(error)), mean / np.where(error > 0, error, np.inf)
+        if np.any(high := np.abs(ratio) > _beyond_chance(count)):
+            differs |= high[cell]
         # Σ (mean / error)² of noise alone is χ² with as many degrees of freedom as cells.
-        chi_square = float(np.sum((mean[error > 0] / error[error > 0]) ** 2))
-        ripple |= chi_square - 2 * count > _CHANCE * np.sqrt(2 * count)
+        ripple |= float(ratio @ ratio) - 2 * count > _CHANCE * np.sqrt(2 * count)
     # Without noise there is nothing to average.
     chosen = ((np.bincount(levels[0], differs) > 0) | ripple) & (map_.noise > 0)
     some = np.flatnonzero(chosen[levels[0]])
@@ -362,12 +371,17 @@ def _local_features(
     return some, form, own, error[own]
 
 
-def _cells(map_: DeviationMap, side: float) -> IntArray:
-    """Return the number of the square cell of each point (n,); ``side`` in their mean distance."""
+def _cells(map_: DeviationMap, shift: float = 0.0) -> list[IntArray]:
+    """Return the numbers of the square cell of each point (n,), each with half the last one's side.
+
+    shift: of the grid in the largest cells, whose side is eight mean distances of the points
+    """
     spans = np.array([np.ptp(map_.x), np.ptp(map_.y)])
-    pitch = side * float(np.sqrt(np.prod(np.maximum(spans, 1e-3 * spans.max())) / len(map_)))
-    column, row = (((v - v.min()) / pitch).astype(np.int64) for v in (map_.x, map_.y))
-    return np.asarray(column * (int(row.max()) + 1) + row)
+    side = 8 * float(np.sqrt(np.prod(np.maximum(spans, 1e-3 * spans.max())) / len(map_)))
+    places = (((v - v.min()) / side + shift) * 2**_HALVINGS for v in (map_.x, map_.y))
+    column, row = (place.astype(np.int64) for place in places)
+    most, halvings = int(row.max()), reversed(range(_HALVINGS + 1))
+    return [(column >> k) * ((most >> k) + 1) + (row >> k) for k in halvings]
 
 
 def _texture(map_: DeviationMap, rest: FloatArray) -> FloatArray:
@@ -376,7 +390,7 @@ def _texture(map_: DeviationMap, rest: FloatArray) -> FloatArray:
     Fine waves, as of a fingerprint, scatter the points of a cell without a change of its mean. That
     may also be noise, which is larger there.
     """
-    cell = _cells(map_, _CELLS[0])
+    cell = _cells(map_)[0]
     counts = np.bincount(cell)
     square, _ = _cell_means(cell, rest**2, 0.0)
     # R. A. Fisher's √(2 χ²) is nearly normal.
@@ -413,9 +427,9 @@ def _least_risk(cells: Sequence[IntArray], values: FloatArray, noise: float) -> 
 def _cell_means(cell: IntArray, values: FloatArray, noise: float) -> tuple[FloatArray, FloatArray]:
     """Return the mean of ``values`` (n,) in each cell (k,), and its standard error; zero: empty."""
     counts = np.bincount(cell)
-    held = np.maximum(counts, 1)
-    error = np.where(counts > 0, noise / np.sqrt(held), 0.0)
-    return np.asarray(np.bincount(cell, values) / held), error
+    held = np.maximum(np.arange(int(counts.max()) + 1), 1)
+    errors = np.append(0.0, noise / np.sqrt(held[1:]))
+    return np.asarray(np.bincount(cell, values) / held[counts]), errors[counts]
 
 
 def _beyond_chance(count: int) -> float:

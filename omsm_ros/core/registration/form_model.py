@@ -207,8 +207,7 @@ def estimate(
     least = np.maximum(_LEAST_SHARE / np.diag(normal)[dofs:], _LEAST_M**2)
     sizes = np.maximum(largest, least)
     for _ in range(_TURNS):
-        covariance = _inverse(normal, sizes, dofs)
-        found = covariance @ right
+        covariance, found = _solved(normal, right, sizes, dofs)
         unknown = np.diag(covariance)[dofs:] / sizes
         new = _sizes(found[dofs:], unknown, least, group)
         new = np.clip(new, least, np.maximum(_MOST_SHARE * largest, least))
@@ -217,12 +216,15 @@ def estimate(
             break
     likely = covariance[:dofs, :dofs] / scales[:dofs, :dofs]
     sizes = _upper_variances(sizes, np.diag(covariance)[dofs:] / sizes, group)
-    covariance = _inverse(normal, sizes, dofs)
-    step, form = np.split(covariance @ right / scale, [dofs])
+    covariance, found = _solved(normal, right, sizes, dofs)
+    step, form = np.split(found / scale, [dofs])
     return Estimate(step, form, covariance / scales, np.sqrt(sizes), noise, likely)
 
 
-def _inverse(normal: FloatArray, sizes: FloatArray, dofs: int) -> FloatArray:
+def _solved(
+    normal: FloatArray, right: FloatArray, sizes: FloatArray, dofs: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the covariance of the solution of the normal equations, and the solution."""
     full = normal + np.diag(np.append(np.zeros(dofs), 1 / sizes))
     root = 1 / np.sqrt(np.diag(full))
     try:
@@ -232,7 +234,12 @@ def _inverse(normal: FloatArray, sizes: FloatArray, dofs: int) -> FloatArray:
     # Where pose and form are nearly the same, rounding leaves variances below zero.
     if not np.all(np.diag(inverse) > 0):
         raise DataError(NOT_SETTLED)
-    return np.asarray((inverse + inverse.T) / 2, np.float64)
+    inverse = (inverse + inverse.T) / 2
+    found = inverse @ right
+    # Pose parameters may be so alike that the inverse has few digits; the residual restores them.
+    for _ in range(2):
+        found += inverse @ (right - full @ found)
+    return inverse, found
 
 
 def _upper_variances(sizes: FloatArray, unknown: FloatArray, group: IntArray) -> FloatArray:

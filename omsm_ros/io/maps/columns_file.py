@@ -3,7 +3,7 @@
 import io
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any
@@ -317,21 +317,6 @@ _MAX_DATA_BYTES = 200_000_000
 _SLOPES, _HEIGHTS = (1, 3), (2, 4)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DabamProfile:
-    """A profile as it was stored.
-
-    position: [m], (n,);  value: heights [m] or slopes [rad], (n,)
-    slopes: whether ``value`` is slopes
-    header: content of ``NAME.txt``
-    """
-
-    position: FloatArray
-    value: FloatArray
-    slopes: bool
-    header: Mapping[str, Any]
-
-
 def has_dabam_header(path: Path) -> bool:
     """Return whether ``NAME.txt`` describes ``path`` as a profile of DABAM."""
     header_path = path.with_suffix(".txt")
@@ -347,8 +332,11 @@ def _header(path: Path) -> dict[str, Any]:
     return load_object(path, "header", _MAX_HEADER_BYTES)
 
 
-def load_dabam(path: Path) -> DabamProfile:
-    """Read columns and header; FileError if they do not agree."""
+def read_dabam(path: Path) -> MeasuredPoints:
+    """Read a profile as points along x at y = 0; slopes are integrated by the trapezoidal rule.
+
+    Raises FileError if columns and header do not agree.
+    """
     what = f"profile {str(path)!r}"
     header = _header(path.with_suffix(".txt"))
     form, skip = header.get("FILE_FORMAT"), header.get("FILE_HEADER_LINES")
@@ -368,21 +356,9 @@ def load_dabam(path: Path) -> DabamProfile:
         raise FileError(
             f"{what} has no points after its {skip} lines of header; check FILE_HEADER_LINES"
         )
-    position, value = (table[:, i] * float(numbers[i]) for i in (0, 1))
-    return DabamProfile(position, value, form in _SLOPES, header)
-
-
-def read_dabam(path: Path) -> MeasuredPoints:
-    """Read a profile as points along x at y = 0; slopes are integrated by the trapezoidal rule.
-
-    Raises FileError if columns and header do not agree.
-    """
-    profile = load_dabam(path)
-    height, notes = profile.value, ("a profile along x",)
-    if profile.slopes:
-        # Imported here, because it takes half a second to load, and each map needs this module.
-        from scipy.integrate import cumulative_trapezoid
-
-        height = cumulative_trapezoid(profile.value, profile.position, initial=0.0)
-        notes = ("a profile along x; its slopes were integrated",)
-    return measured(profile.position, np.zeros_like(height), height, notes=notes)
+    place, height = (table[:, i] * float(numbers[i]) for i in (0, 1))
+    notes = ("a profile along x",)
+    if form in _SLOPES:
+        steps = np.diff(place) * (height[1:] + height[:-1]) / 2
+        height, notes = np.cumsum([0.0, *steps]), ("a profile along x; its slopes were integrated",)
+    return measured(place, np.zeros_like(height), height, notes=notes)

@@ -102,3 +102,24 @@ def test_a_summit_between_two_tracks_belongs_to_the_figure(along, off, bow):
     whole = extents_of_parts([map_], Aperture(1.5 * R), square, pitch)[0][0]
     assert abs(whole.value - height) <= 2 * whole.uncertainty
     assert whole.uncertainty < 0.25 * height
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_pip_that_the_cells_divide_belongs_to_the_figure(seed):
+    """A pip in the middle of four points, where the cells of any size about the middle meet.
+
+    Four times the noise above the form at its nearest points, and half as high again between them.
+    """
+    lines = np.linspace(-R, R, 100)
+    x, y = (v.ravel() for v in np.meshgrid(lines, lines))
+    step = lines[1] - lines[0]
+    pip = 60e-9 * np.exp(-(x**2 + y**2) / (1.1 * step) ** 2)
+    form = 20e-9 * (x**2 - y**2) / R**2 + pip
+    noise = np.random.default_rng(seed + 90).normal(0, NOISE, len(x))
+    map_ = DeviationMap(x=x, y=y, deviation=form + noise, area=np.ones(len(x)),
+                        effects=np.empty((0, len(x))), noise=NOISE)  # fmt: skip
+    square = Aperture.of("rectangle", R, R)
+    whole = extents_of_parts([map_], Aperture(1.5 * R), square, step)[0][0]
+    truth = 60e-9 + 20e-9
+    assert abs(whole.value - truth) <= 2 * whole.uncertainty
+    assert whole.uncertainty < 0.3 * truth

@@ -259,6 +259,32 @@ def test_what_more_than_one_point_of_twenty_does_is_no_dust():
     assert outlier_limit(np.zeros(100)) == LEAST_LIMIT_M
 
 
+def test_pose_parameters_that_are_nearly_alike_are_solved_to_the_last_digit():
+    """Two moves whose effects differ by a part in a million: the step changes nothing it fits.
+
+    A second solution, of what the first leaves, is far below its uncertainty in every direction.
+    """
+    basis, x, y = over("disc")
+    z = basis.columns(x, y)
+    moves = np.stack([np.ones_like(x), x / RADIUS, x / RADIUS + 1e-6 * (x / RADIUS) ** 3])
+    deviation = 1e-6 * (moves[1] - moves[2] / 2) + 20e-9 * z[3] + 1e-9 * RNG.normal(size=len(x))
+    columns = np.concatenate([moves, z])
+    prior = np.zeros(3), np.full(3, 1e-3)
+
+    def solved(data):
+        given = columns @ columns.T, columns @ data, 1e-18, float(np.mean(data**2))
+        return estimate(*given, basis.group, prior)
+
+    first = solved(deviation)
+    left = deviation - np.concatenate([first.step, first.form]) @ columns
+    assert np.std(left) < 1.05e-9
+    again = np.linalg.solve(
+        columns @ columns.T / 1e-18 + np.diag([1e6] * 3 + [*first.sizes**-2.0]),
+        columns @ left / 1e-18 - np.append(first.step * 1e6, first.form / first.sizes**2),
+    )
+    assert first._replace(step=again[:3]).length < 1e-2
+
+
 @pytest.mark.parametrize("rate", [0.5, -0.5, -1.5])
 def test_a_relaxed_step_finds_the_end_of_a_series_at_once(rate):
     """For steps that change by a constant factor Aitken's share is 1/(1 − rate)."""

@@ -1,5 +1,6 @@
 """Maps that others measured, with the figures that were published with them."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,6 @@ from omsm_ros.core.registration.placement import PointBatch
 from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import FileError
-from omsm_ros.io.maps.columns_file import load_dabam
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.units import LengthUnits
 
@@ -33,34 +33,39 @@ def test_the_zeiss_map():
     assert np.std(rest) == pytest.approx(1.52e-9, abs=0.005e-9)
 
 
+def _described(name):
+    return json.loads((DATA / "dabam" / f"dabam-{name}.txt").read_text())
+
+
 @pytestmark_data
 def test_a_dabam_profile_of_heights():
-    profile = load_dabam(DATA / "dabam" / "dabam-012.dat")
+    header = _described("012")
     points = read_points(DATA / "dabam" / "dabam-012.dat")
-    assert not profile.slopes
-    assert np.ptp(points.x) == pytest.approx(profile.header["LENGTH_OPTICAL"], abs=1e-3)
+    assert np.ptp(points.x) == pytest.approx(header["LENGTH_OPTICAL"], abs=1e-3)
     # The header's figures are of the residual, whose columns the file repeats beside.
     raw = np.loadtxt(DATA / "dabam" / "dabam-012.dat", skiprows=1)
     slope = np.std(raw[:, 4])
-    assert slope == pytest.approx(profile.header["CALC_SLOPE_RMS"], rel=2e-3)
+    assert slope == pytest.approx(header["CALC_SLOPE_RMS"], rel=2e-3)
     best = points.height - np.polyval(np.polyfit(points.x, points.height, 2), points.x)
-    assert np.std(best) == pytest.approx(profile.header["CALC_HEIGHT_RMS"] * 1e-9, rel=0.1)
+    assert np.std(best) == pytest.approx(header["CALC_HEIGHT_RMS"] * 1e-9, rel=0.1)
 
 
 @pytestmark_data
 def test_a_dabam_profile_of_slopes():
-    profile = load_dabam(DATA / "dabam" / "dabam-018.dat")
-    points = read_points(DATA / "dabam" / "dabam-018.dat")
-    assert profile.slopes
-    assert np.ptp(points.x) == pytest.approx(profile.header["LENGTH_OPTICAL"], abs=1e-3)
+    header, path = _described("018"), DATA / "dabam" / "dabam-018.dat"
+    points = read_points(path)
+    assert "its slopes were integrated" in points.notes[0]
+    assert np.ptp(points.x) == pytest.approx(header["LENGTH_OPTICAL"], abs=1e-3)
+    columns = np.loadtxt(path, skiprows=header["FILE_HEADER_LINES"], usecols=(0, 1)).T
+    position, slope = columns * [[header["X1_FACTOR"]], [header["Y1_FACTOR"]]]
     # Its own text says 24.4 km and, less that circle, 0.12 µrad of residual slope.
-    line = np.polyfit(profile.position, profile.value, 1)
+    line = np.polyfit(position, slope, 1)
     assert 1 / line[0] == pytest.approx(24.4e3, rel=0.02)
-    rest = profile.value - np.polyval(line, profile.position)
-    stated = profile.header["CALC_SLOPE_RMS"] * profile.header["CALC_SLOPE_RMS_FACTOR"]
+    rest = slope - np.polyval(line, position)
+    stated = header["CALC_SLOPE_RMS"] * header["CALC_SLOPE_RMS_FACTOR"]
     assert np.std(rest) == pytest.approx(stated, rel=0.05)
     back = np.gradient(points.height, points.x)[1:-1]
-    assert back == pytest.approx(profile.value[1:-1], abs=0.1e-6)
+    assert back == pytest.approx(slope[1:-1], abs=0.1e-6)
 
 
 @pytestmark_data
