@@ -150,20 +150,25 @@ class BlockDecoder(PacketFinder):
         super().__init__()
         self.head = HEADERS[form]
         self._dtype_of = dtype_of
+        self._width_at: int | None = None  # which of the two is the length of a frame
 
     def _measure(self, place: int) -> tuple[int, bool]:
         count, width = self._shape(self.head.unpack_from(self._buffer, place))
         return self.head.size + count * width if count else 0, True
 
     def _shape(self, fields: tuple[int, ...]) -> tuple[int, int]:
-        """Return number and length of the frames, in either order; (0, 0) if neither fits."""
+        """Return number and length of the frames; (0, 0) if they do not fit.
+
+        They may have either order, but all blocks have the same.
+        """
         try:
             width = self._dtype_of((fields[3], fields[4])).itemsize
         except ProtocolError:
             return 0, 0
-        first, second = fields[-3], fields[-2]
-        count = first if second == width else second if first == width else 0
-        return (count, width) if count else (0, 0)
+        for at in (-2, -3) if self._width_at is None else (self._width_at,):
+            if fields[at] == width and fields[-5 - at]:
+                return fields[-5 - at], width
+        return 0, 0
 
     def _take(self, place: int, size: int, found: list[MeasurementBlock]) -> int:
         if not size:
@@ -171,6 +176,8 @@ class BlockDecoder(PacketFinder):
             return 1
         fields = self.head.unpack_from(self._buffer, place)
         count, width = self._shape(fields)
+        if count != width:
+            self._width_at = -2 if fields[-2] == width else -3
         raw = np.frombuffer(self._buffer, np.uint8, count * width, place + self.head.size)
         self._packets += 1
         self._understood += size
