@@ -178,23 +178,28 @@ def _expected_drift(x: FloatArray, y: FloatArray) -> tuple[float, float]:
     return 0.0, _DRIFT_SIGMA
 
 
-# The reference: the number of spans, the least number, and that from which on the limit of what is
-# late only falls.
-_SPANS, _LEAST_SPANS, _MANY_SPANS = 50, 4, 15
+# The first spans are shorter, so that the first second holds several [s].
+_FIRST_S, _FIRST_SPANS = 0.05, 40
+# The largest number of spans up to the last confirmation, and after it.
+_SPANS, _LATEST = 50, 60
+# The least number of spans to be judged, and without a confirming arrival among them.
+_LEAST_SPANS, _SHOWING = 8, 3
+# Missed triggers are excluded, or likelier than this (log), and their number is certain, before
+# there is a reference and with it.
+_EXCLUDED, _POSSIBLE, _CERTAIN = 6.0, 1.0, 12.0
+# The latest spans, in which no step can be excluded.
+_OPEN = 5
+# Without a reference for longer, it is the scatter of the arrivals that hides missed triggers [s].
+_SCATTERED_S = 5.0
+# Without a reference, so short a time before a pause is taken to be without missed triggers [s].
+_UNKNOWN_S = 1.0
 # The last sample of a portion may be nearly a period old: the lateness that confirms [period].
 _LATE_PERIODS, _AGE_PERIODS = 0.75, 0.25
-# Spans in whose earliest arrival the delays by a busy host are short, as a rule. The limit is at
-# least this multiple of that delay.
+# Spans among whose earliest arrivals two are nearly in time, as a rule. The limit for scattered
+# arrivals is this multiple of their difference.
 _WINDOW, _USUAL = 4, 2.0
-# This number of spans without a confirming arrival shows how many triggers were missed.
-_SHOWING = 3
-# It is certain if it is likelier than any other by this (log), by the latest spans of one of these
-# numbers; earlier ones may be from before the missed triggers.
-_CERTAIN, _LATEST = 12.0, (12, 16, 20, 24, 32, 48, 64, 96)
 # Resolution of arrivals [period].
 _NARROWEST = 0.01
-# The true number is searched within this distance of the one that the old line shows [periods].
-_NEAR = 4
 
 
 class MissedTriggerDetector:
@@ -203,64 +208,67 @@ class MissedTriggerDetector:
     No sample arrives before it was taken, so a line below the earliest arrivals is even although
     others are late by chance. After a missed trigger all arrivals are late by a period. An arrival
     that is not late confirms all samples up to it; lateness alone proves nothing, so until then
-    they wait. A busy host later does not widen the limit of what is late.
+    they wait. After a pause of the trigger all arrivals are late for good, after one of the host
+    they return to the line.
 
-    seen_from: least number of missed triggers that exceeds the scatter of the arrivals
+    resumed: first arrival after the last pause of the trigger [s]
+    lost: triggers may have been missed before a pause, so nothing is confirmed until a restart
     """
 
-    def __init__(self, period: float) -> None:
-        """period: of the trigger [s]."""
-        self._period = period
+    def __init__(self, period: float, pause: float = math.inf) -> None:
+        """period: of the trigger [s];  pause: arrivals late by half of it may be after a pause."""
+        self._period, self._pause = period, pause
+        self._counted = 0
         self.restart()
 
     def restart(self) -> None:
-        """Forget all arrivals, as after a pause of the trigger."""
-        # Begin and earliest lateness of each span [s].
-        self._earliest: list[tuple[float, float]] = []
-        self._line: tuple[float, float] | None = None  # lateness of the earliest at 0, drift
-        self._limit, self.seen_from = math.inf, 1
-        # Last arrival that confirmed, and begin of the last span that was judged [s].
-        self._confirmed = self._judged = 0.0
+        """Forget all arrivals, as after a restart of the device."""
+        self._reference = _Reference(self._period)
+        self._after_pause: _Reference | None = None
+        self._newest = self._paused = 0.0  # last arrival, and last one before the silence [s]
+        self.resumed, self.lost = -math.inf, False
 
-    def confirms(self, due: float, arrival: float) -> bool:
+    def confirms(self, due: float, arrival: float, *, after_silence: bool = False) -> bool:
         """Return whether no trigger was missed before this arrival, as far as can be seen.
 
         due: count times period [s];  arrival: monotonic [s]
+        after_silence: of the trigger, the line or the host
         """
-        late, excess = arrival - due, self.excess(due, arrival)
-        # The drift of crystals makes a line uncertain that is not confirmed any more.
-        limit = self._limit - 2 * _DRIFT_SIGMA * (arrival - self._confirmed)
-        confirmed = limit > 0 and excess <= limit
-        if confirmed:
-            self._confirmed = arrival
-            if self._line is not None and excess < 0:
-                self._line = (self._line[0] + excess, self._line[1])
-        if self._earliest and arrival - self._earliest[-1][0] < _SPAN_S:
-            begin, least = self._earliest[-1]
-            self._earliest[-1] = (begin, min(least, late))
-        else:
-            self._set_reference()
-            self._earliest.append((arrival, late))
-            known = sum(begin <= self._confirmed for begin, _ in self._earliest)
-            del self._earliest[known : max(len(self._earliest) - _LATEST[-1] - 1, known)]
-            del self._earliest[: max(known - _SPANS, 0)]
-        return confirmed
+        excess = self._reference.excess(due, arrival)
+        if abs(excess) <= self._pause / 2:
+            self._after_pause = None
+        elif after_silence or (self._reference.proven and excess < 0):
+            self._paused = self._paused if self._after_pause else self._newest
+            self._after_pause = _Reference(self._period)
+        self._newest = arrival
+        if self._after_pause is None:
+            return self._reference.confirms(due, arrival) and not self.lost
+        if not self._after_pause.confirms(due, arrival):
+            return False
+        # Its line says nothing of triggers missed before the pause.
+        self._counted += self._reference.missed
+        self.lost |= not self._reference.trusted_until(self._paused)
+        self._reference, self._after_pause = self._after_pause, None
+        self.resumed = self._reference.begin
+        return not self.lost
 
-    def excess(self, due: float, arrival: float) -> float:
-        """Return by how much an arrival is later than the earliest ones [s]; -inf if not known."""
-        if self._line is None:
-            return -math.inf
-        return arrival - due - self._line[0] - self._line[1] * arrival
+    def trusts_last(self) -> bool:
+        """Return whether no trigger was missed before the last arrival, if no other follows.
+
+        So it is assumed of a short time; a longer one without an arrival in time is doubtful.
+        """
+        trusted = self._reference.trusted_until(self._newest)
+        return trusted and self._after_pause is None and not self.lost
 
     @property
     def missed(self) -> int:
-        """Return the missed triggers that the latest arrivals show if none confirms; else 0."""
-        _, since = self._spans()
-        if self._line is None or len(since) < _SHOWING:
-            return 0
-        begin, late = since[-_WINDOW:].T
-        excess = float((late - self._line[0] - self._line[1] * begin).min())
-        return max(math.floor(excess / self._period + _AGE_PERIODS), 0)
+        """Return the missed triggers that were found, and that the latest arrivals show."""
+        return self._counted + self._reference.missed
+
+    @property
+    def seen_from(self) -> int:
+        """Return the least number of missed triggers that exceeds the scatter of the arrivals."""
+        return self._reference.seen_from
 
     def forget_missed(self) -> int:
         """Return the number of missed triggers if it is certain, else 0.
@@ -268,56 +276,145 @@ class MissedTriggerDetector:
         Arrivals are then expected at the times of the triggers again, so their samples must be
         renumbered.
         """
-        if self._judged == self._earliest[-1][0]:
+        reference = self._after_pause or self._reference
+        found, reference.found = reference.found, 0
+        self._counted += found
+        return found
+
+
+class _Reference:
+    """The line below the arrivals since the start, or since a pause of the trigger.
+
+    begin: of its first span [s];  confirmed: last arrival that was not late [s]
+    proven: no step by missed triggers explains the arrivals
+    found: number of missed triggers, if it became certain with the last arrival
+    """
+
+    def __init__(self, period: float) -> None:
+        self._period = period
+        self._earliest: list[tuple[float, float]] = []  # begin and lateness of each span [s]
+        self._line = 0.0, 0.0  # lateness of the earliest at 0, drift
+        self._limit, self.seen_from = _LATE_PERIODS * period, 1
+        self.proven = False
+        self.begin = self.confirmed = self._judged = 0.0
+        self.found = 0
+
+    def confirms(self, due: float, arrival: float) -> bool:
+        """Return whether no trigger was missed before this arrival, as far as can be seen."""
+        late = arrival - due
+        width = _FIRST_S if not self.proven and len(self._earliest) < _FIRST_SPANS else _SPAN_S
+        if self._earliest and arrival - self._earliest[-1][0] < width:
+            begin, least = self._earliest[-1]
+            self._earliest[-1] = (begin, min(least, late))
+        else:
+            if self._earliest:
+                self._judge()
+            known = sum(begin <= self.confirmed for begin, _ in self._earliest)
+            begun = max(known, _FIRST_SPANS)  # a step soon after the start is still to be seen
+            del self._earliest[begun : max(len(self._earliest) - _LATEST, begun)]
+            del self._earliest[: max(known - _SPANS, 0)]
+            self._earliest.append((arrival, late - self.found * self._period))
+        self.begin = self.begin or arrival
+        excess = self.excess(due, arrival)
+        # The drift of crystals makes a line uncertain that is not confirmed any more.
+        limit = self._limit - 2 * _DRIFT_SIGMA * (arrival - self.confirmed)
+        if not self.proven or self.found or excess > limit or limit <= 0:
+            return False
+        self.confirmed = arrival
+        self._line = (self._line[0] + min(excess, 0.0), self._line[1])
+        return True
+
+    def excess(self, due: float, arrival: float) -> float:
+        """Return by how much an arrival is later than the earliest ones [s]."""
+        late = arrival - due
+        if not self.proven:
+            return late - min((least for _, least in self._earliest), default=late)
+        return late - self._line[0] - self._line[1] * arrival
+
+    @property
+    def missed(self) -> int:
+        """Return the missed triggers that the latest arrivals show if none confirms; else 0."""
+        since = [span for span in self._earliest if span[0] > self.confirmed]
+        if not self.proven or len(since) < _SHOWING:
             return 0
-        self._judged = self._earliest[-1][0]
-        before, since = self._spans()
-        for number in _LATEST:
-            latest = since[-number - 1 : -1]  # the last one has not ended
-            if len(latest) < number:
-                break
-            if (missed := self._missed_between(before, latest)) is not None:
-                latest[:, 1] -= missed * self._period
-                self._confirmed = self._earliest[-1][0]
-                self._earliest = [*map(tuple, before), *map(tuple, latest)]
-                self._set_reference()
-                return missed
-        return 0
+        begin, late = np.array(since[-_WINDOW:]).T
+        excess = float((late - self._line[0] - self._line[1] * begin).min())
+        return max(math.floor(excess / self._period + _AGE_PERIODS), 0)
 
-    def _missed_between(self, before: FloatArray, since: FloatArray) -> int | None:
-        """Return by how many periods spans ``since`` (n, 2) are later; None if not certain.
+    def trusted_until(self, arrival: float) -> bool:
+        """Return whether arrivals until then need not be confirmed, because the time is short."""
+        waited = arrival - max(self.confirmed, self.begin)
+        return waited <= (_SPAN_S if self.proven else _UNKNOWN_S)
 
-        With the true number, both lie at one edge, with another only one of them.
+    def _judge(self) -> None:
+        """Lay the line below the arrivals; look for missed triggers if none is confirmed.
+
+        Arrivals after missed triggers are renumbered if their number is certain.
         """
-        likely = {}
-        for missed in range(max(self.missed - _NEAR, 0), self.missed + _NEAR):
-            begin, late = np.concatenate([before, since - [0.0, missed * self._period]]).T
-            *_, rest, unlikely = _line_below(begin - begin[-1], late)
-            likely[missed] = _edge(rest / self._period) - unlikely
-        other, best = sorted(likely, key=likely.__getitem__)[-2:]
-        return best if likely[best] - likely[other] > _CERTAIN else None
-
-    def _spans(self) -> tuple[FloatArray, FloatArray]:
-        """Return the spans (n, 2) before and after the last confirmation."""
-        spans = np.reshape(self._earliest, (-1, 2))
-        begin = spans[:, 0]
-        return spans[begin + _SPAN_S <= self._confirmed], spans[begin > self._confirmed]
-
-    def _set_reference(self) -> None:
-        """Lay the highest line below the earliest arrivals; their scatter is the limit."""
-        begin, late = np.reshape(self._earliest, (-1, 2)).T
-        learning = len(begin) < _MANY_SPANS
-        sure = begin <= (math.inf if learning else self._confirmed)
-        if np.sum(sure) < _LEAST_SPANS:
+        begin, late = np.array(self._earliest).T
+        known = int(np.searchsorted(begin, self.confirmed, "right"))
+        if self.proven:
+            self._set_line(known)
+        if len(begin) < max(_LEAST_SPANS, known + _SHOWING):
             return
-        least, drift, *_ = _line_below((begin - begin[-1])[sure], late[sure])
+        waited = float(begin[-1]) - max(self.confirmed, self.begin)
+        if begin[-1] - self._judged < max(_SPAN_S, waited / 10):
+            return
+        self._judged = float(begin[-1])
+        _, drift, rest, _ = _line_below(begin - begin[-1], late)
+        in_lapse = abs(drift) > _GROSS
+        if not self.proven and (in_lapse or waited > _SCATTERED_S):
+            self._set_limit(rest)
+        missed = 0 if in_lapse else self._settle(known)
+        if missed == 0 or (missed and self.proven):
+            self.proven, self.confirmed = True, self._judged
+            self._set_line(len(begin))
+        self.found = missed or 0
+
+    def _settle(self, first: int) -> int | None:
+        """Return how many triggers were missed from a span on, None if that is not certain.
+
+        Arrivals after them are expected earlier from then on.
+        """
+        begin, late = np.array(self._earliest).T
+        since = begin - begin[-1]
+        *_, rest, unlikely = _line_below(since, late)
+        none, found = _edge(rest / self._period) - unlikely, []
+        level = late - self._line[1] * since
+        for at in range(max(first, 1), len(late)):
+            apart = float(rest[at:].min()), float(level[at:].min() - level[:at].min())
+            shown = {math.floor(each / self._period + _AGE_PERIODS) for each in apart}
+            for missed in {max(n + k, self.seen_from) for n in shown for k in (0, 1)}:
+                shifted = np.append(late[:at], late[at:] - missed * self._period)
+                *_, rests, unlikely = _line_below(since, shifted)
+                found.append((at, missed, _edge(rests / self._period) - unlikely - none))
+        steps, numbers, likely = np.array(found).T
+        at, best, most = found[int(np.argmax(likely))]
+        other = likely[numbers != best].max(initial=0.0)
+        if most > _CERTAIN and most - other > (_CERTAIN if self.proven else _EXCLUDED):
+            moved = [(b, y - best * self._period) for b, y in self._earliest[at:]]
+            self._earliest[at:] = moved
+            return best
+        possible = set(steps[likely > -_EXCLUDED])
+        last = max(set(steps) - possible, default=0)
+        return 0 if most < _POSSIBLE and last >= len(late) - _OPEN else None
+
+    def _set_line(self, known: int) -> None:
+        """Lay the highest line below the earliest arrivals of the first spans."""
+        begin, late = np.array(self._earliest).T
+        since = begin - begin[-1]
+        least, drift, *_ = _line_below(since[:known], late[:known])
         self._line = (least - drift * float(begin[-1]), drift)
-        # All arrivals count, or the limit would fall by leaving late ones out.
-        rest = late - least - drift * (begin - begin[-1])
-        windows = sliding_window_view(rest, min(_WINDOW, len(rest)))
-        usual = _USUAL * float(np.median(windows.min(axis=1)))
-        limit = max(_LATE_PERIODS * self._period, usual + _AGE_PERIODS * self._period)
-        self._limit = limit if learning else min(self._limit, limit)
+        if self.seen_from > 1:
+            # All arrivals count, or the limit would fall by leaving late ones out.
+            self._set_limit(late - least - drift * since, self._limit)
+
+    def _set_limit(self, rest: FloatArray, most: float = math.inf) -> None:
+        """Set the limit by the scatter of the rests above the line (n,), which no step explains."""
+        windows = np.sort(sliding_window_view(rest, _WINDOW), axis=1)
+        usual = _USUAL * float(np.median(windows[:, 1] - windows[:, 0]))
+        usual = max(_LATE_PERIODS * self._period, usual + _AGE_PERIODS * self._period)
+        self._limit = min(usual, most)
         self.seen_from = math.ceil(self._limit / self._period)
 
 

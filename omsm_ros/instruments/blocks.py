@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray, IntArray
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, IntArray
 from omsm_ros.instruments.arrivals import DeviceClock, MissedTriggerDetector
 from omsm_ros.instruments.counting import SAMPLE, CountedRun, Samples, Turns
 from omsm_ros.instruments.scaling import AXES, AxisScaling
@@ -81,12 +81,6 @@ def wrapping(axes: tuple[AxisScaling, ...] | None, counts: int) -> tuple[AxisSca
 _FROM_ZERO, _PART_OF_BEFORE = 10_000, 0.1
 
 
-def _begin_at_zero(before: IntArray, after: IntArray) -> bool:
-    """Return whether all encoders that were away from zero are back at it after a restart."""
-    away = np.abs(before) > _FROM_ZERO
-    return bool(away.any() and np.all(np.abs(after[away]) < _PART_OF_BEFORE * np.abs(before[away])))
-
-
 class BlockCutter:
     """Cuts runs into blocks of ``block_size`` samples; a gap or restart ends a block early.
 
@@ -111,16 +105,17 @@ class BlockCutter:
         # one device latches stay together.
         together = channels.distance and channels.axes is not None
         watched = not (channels.timed or settings.free_running or together)
-        self._detector = MissedTriggerDetector(settings.sample_period) if watched else None
-        self._waiting: deque[tuple[float, CountedRun]] = deque()  # arrival [s]
+        period, pause = settings.sample_period, settings.pause
+        self._detector = MissedTriggerDetector(period, pause) if watched else None
+        # Arrival, the same by the clock of the stamps, whether after a silence.
+        self._waiting: deque[tuple[float, int, bool, list[CountedRun]]] = deque()
         self._counts = np.zeros(len(AXES), np.int64)  # of the last sample
         self.restarted_at_zero = self.perhaps_at_zero = self.lost_settings = False
         # Device time less that of the count, and arrival, of the last samples [ns].
         self._usual: tuple[int, int] | None = None
         self._due = self._doubtful = 0  # time by the count; an offset to be confirmed
-        self._missed_before = 0  # the last pause, restart or renumbering
         self._skipped = 0  # counts left out for missed triggers
-        self._lost = self.unconfirmed = False  # whether triggers were missed before a pause
+        self.unconfirmed = False
         self.delivered = self.withheld = self.blocks = self.period_warnings = self.resets = 0
         self.period_deviation = 0.0
         self._evenly_wrong = False
@@ -128,12 +123,13 @@ class BlockCutter:
     @property
     def pending(self) -> int:
         """Return the number of samples that wait for their block, or for later arrivals."""
-        return len(self._pending) + sum(len(run.samples) for _, run in self._waiting)
+        waiting = (run for *_, runs in self._waiting for run in runs)
+        return len(self._pending) + sum(len(run.samples) for run in waiting)
 
     @property
     def missed(self) -> int:
         """Return the triggers without a sample of the device, by the arrivals of the others."""
-        return self._missed_before + (self._detector.missed if self._detector else 0)
+        return self._detector.missed if self._detector else 0
 
     @property
     def least_missed(self) -> int:
@@ -176,35 +172,41 @@ class BlockCutter:
         if self._detector is None or not runs:
             yield from self._cut(runs, arrival_ns, after_silence)
             return
-        restarted = any(run.restarted for run in runs)
-        self._skipped *= not restarted
-        runs = [replace(run, first_sample=run.first_sample + self._skipped) for run in runs]
-        due = (runs[-1].first_sample + len(runs[-1].samples) - 1) * self._settings.sample_period
-        # After a pause of the trigger, but not of the host, the samples are late by it.
-        paused = after_silence and abs(self._detector.excess(due, now)) > self._settings.pause / 2
-        if paused or restarted:
-            self._lost |= self.unconfirmed or self._detector.missed > 0
-            self._lost &= not restarted
-            self._missed_before = self.missed
-            self._withhold(np.inf)
+        if any(run.restarted for run in runs):
+            self.withhold()
+            self._skipped = 0
             self._detector.restart()
-        self._waiting += [(now, run) for run in runs]
-        if self._detector.confirms(due, now) and not self._lost:
-            confirmed = [run for _, run in self._waiting]
-            self._waiting.clear()
-            self.unconfirmed = False
-            yield from self._cut(confirmed, arrival_ns, after_silence)
+        runs = [replace(run, first_sample=run.first_sample + self._skipped) for run in runs]
+        self._waiting.append((now, arrival_ns, after_silence, runs))
+        due = (runs[-1].first_sample + len(runs[-1].samples) - 1) * self._settings.sample_period
+        if self._detector.confirms(due, now, after_silence=after_silence):
+            yield from self._release(self._detector)
         elif missed := self._detector.forget_missed():
-            self._withhold(np.inf)
+            self.withhold()
             self._skipped += missed
-            self._missed_before += missed
-        self._withhold(now - _LONGEST_S)
-        self.unconfirmed |= bool(self._waiting) and self._waiting[0][0] < now - _LONG_S
+        patience = _LONG_S if self._detector.missed else _LONGEST_S
+        self.unconfirmed |= bool(self._waiting) and self._waiting[0][0] < now - patience
+        self.withhold(now - _LONGEST_S)
 
-    def _withhold(self, until: float) -> None:
-        """Withhold the samples that arrived before ``until`` [s]."""
+    def _release(self, detector: MissedTriggerDetector) -> Iterator[BlockPair]:
+        """Yield the blocks completed by the samples that wait."""
+        self.unconfirmed = False
+        while self._waiting:
+            came, came_ns, after_silence, runs = self._waiting.popleft()
+            if came == detector.resumed:
+                self._clock.restart()
+            yield from self._cut(runs, came_ns, after_silence)
+
+    def end(self) -> Iterator[BlockPair]:
+        """Yield what is left at the end of the stream, or before a long pause."""
+        if self._detector is not None and self._detector.trusts_last():
+            yield from self._release(self._detector)
+        yield from self.flush()
+
+    def withhold(self, until: float = np.inf) -> None:
+        """Withhold the samples that arrived before ``until`` [s] and are not confirmed."""
         while self._waiting and self._waiting[0][0] < until:
-            self.withheld += len(self._waiting.popleft()[1].samples)
+            self.withheld += sum(len(run.samples) for run in self._waiting.popleft()[-1])
 
     def _cut(
         self, runs: Sequence[CountedRun], arrival_ns: int, after_silence: bool
@@ -230,7 +232,9 @@ class BlockCutter:
         During a silence the axes may have moved to their origin and the counter may have been
         reset on purpose, unless the device lost its connection or its settings too.
         """
-        at_zero = _begin_at_zero(self._counts, run.samples["counts"][0])
+        before, after = np.abs(self._counts), np.abs(run.samples["counts"][0])
+        away = before > _FROM_ZERO
+        at_zero = bool(away.any() and np.all(after[away] < _PART_OF_BEFORE * before[away]))
         self.restarted_at_zero |= at_zero and (self.lost_settings or not after_silence)
         self.perhaps_at_zero = at_zero and not self.restarted_at_zero
 
@@ -242,8 +246,8 @@ class BlockCutter:
         after_silence: bool,
     ) -> None:
         """Enter the arrival of the last sample before a restart of the device."""
-        continuous = self._channels.timed or self._settings.free_running
-        if runs[0].restarted or (after_silence and not continuous):
+        may_pause = not (self._channels.timed or self._settings.free_running or self._detector)
+        if runs[0].restarted or (after_silence and may_pause):
             self._clock.restart()
         anew = (i for i, run in enumerate(runs) if i and run.restarted)
         self._clock.observe(int(times[next(anew, len(runs)) - 1][-1]), arrival_ns)
@@ -258,8 +262,7 @@ class BlockCutter:
             yield from self._take(self._settings.block_size)
 
     def flush(self) -> Iterator[BlockPair]:
-        """Yield the partial block, if any; samples that are not confirmed are withheld."""
-        self._withhold(np.inf)
+        """Yield the partial block, if any."""
         if len(self._pending):
             yield from self._take(len(self._pending))
 
@@ -327,8 +330,12 @@ class BlockCutter:
             "sample_period": self._settings.sample_period,
         }
         axes = distance = None
-        if self._channels.axes is not None:
-            axes = AxisBlock(**common, **self._positions(samples, self._channels.axes))  # type: ignore[arg-type]
+        if (scaling := self._channels.axes) is not None:
+            counts = samples["counts"].T[: len(scaling)]
+            turned = [turns.continued(c) for turns, c in zip(self._turns, counts, strict=True)]
+            columns = zip(AXES, scaling, turned, strict=True)
+            positions = {name: axis.values(column) for name, axis, column in columns}
+            axes = AxisBlock(**common, **positions)  # type: ignore[arg-type]
         if self._channels.distance:
             reported = not np.isnan(samples["intensity"]).all()
             distance = DistanceBlock(
@@ -338,15 +345,3 @@ class BlockCutter:
                 intensity=samples["intensity"] if reported else np.empty(0, np.float32),
             )
         return BlockPair(axes, distance)
-
-    def _positions(
-        self, samples: Samples, scaling: tuple[AxisScaling, ...]
-    ) -> dict[str, FloatArray]:
-        turned = [
-            turns.continued(counts)
-            for turns, counts in zip(self._turns, samples["counts"].T[: len(scaling)], strict=True)
-        ]
-        return {
-            name: axis.values(column)
-            for name, axis, column in zip(AXES, scaling, turned, strict=True)
-        }

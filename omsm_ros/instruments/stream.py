@@ -142,6 +142,8 @@ class StreamDevice:
         if silent <= self._settings.pause:
             return []
         blocks = self._end(arrival_ns)
+        if silent > UNREADABLE_S:
+            blocks += self._cutter.end()
         silent = now - max(self._heard, self._opened)
         self._listen_in(silent)
         if 0 < self._settings.renew < silent:
@@ -153,7 +155,8 @@ class StreamDevice:
     def close(self) -> list[BlockPair]:
         """Disconnect and hand over the partial block, if any."""
         off = self._cutter.lost_settings
-        blocks = self._end(self._now_ns())
+        blocks = [*self._end(self._now_ns()), *self._cutter.end()]
+        self._cutter.withhold()
         self._cutter.lost_settings = off  # what waited was measured before
         self._transport.close()
         return blocks

@@ -218,7 +218,7 @@ def test_late_arrivals_alone_are_no_missed_triggers() -> None:
 
 
 @pytest.mark.parametrize(("period", "at"), [(1e-3, 5.0), (2e-4, 5.0), (1e-3, 2.0)])
-def test_missed_triggers_are_certain_after_three_windows(period: float, at: float) -> None:
+def test_missed_triggers_are_certain_within_two_seconds(period: float, at: float) -> None:
     random, detector = np.random.default_rng(3), MissedTriggerDetector(period)
     missed, certain, counted, resumed = 2, 0.0, 0, 0.0
     for due in np.arange(1, 1000) * 0.01:
@@ -231,14 +231,12 @@ def test_missed_triggers_are_certain_after_three_windows(period: float, at: floa
         if not confirmed and (found := detector.forget_missed()):
             counted, certain = counted + found, taken
     assert counted == missed
-    assert 2.4 < certain - at < 3.0
+    assert certain - at < 2.0
     assert certain < resumed < certain + 0.1
 
 
-@pytest.mark.parametrize(("quick", "earliest", "latest"), [(0.2, 7.4, 8.5), (0.004, 9.0, 28.0)])
-def test_a_busy_host_tells_later_how_many_were_missed(
-    quick: float, earliest: float, latest: float
-) -> None:
+@pytest.mark.parametrize(("quick", "latest"), [(0.2, 8.5), (0.004, 28.0)])
+def test_a_busy_host_tells_later_how_many_were_missed(quick: float, latest: float) -> None:
     """After the missed triggers a share ``quick`` of the arrivals is in time, the others late."""
     random, detector = np.random.default_rng(4), MissedTriggerDetector(PERIOD)
     missed, certain = 2, 0.0
@@ -252,7 +250,7 @@ def test_a_busy_host_tells_later_how_many_were_missed(
             certain = taken
             break
     assert found == missed
-    assert earliest < certain < latest
+    assert certain < latest
 
 
 def test_what_the_arrivals_cannot_show_is_stated() -> None:
