@@ -46,7 +46,8 @@ class Quantity:
         if type(value) is (int if self.whole else float) and self.low <= value <= self.high:
             return value  # the usual case, kept fast
         number = _number(value, self.whole)
-        if number is None or not self._in_range(number):
+        size = abs(number) if number and self.signed else number
+        if number is None or not self.low <= size <= self.high:
             raise error(self._refusal(value, name))
         return number
 
@@ -93,9 +94,6 @@ class Quantity:
         """The range with its unit, for messages."""
         sign, unit = "±" if self.signed else "", f" {self.unit}" if self.unit else ""
         return f"from {sign}{self.low:g} to {sign}{self.high:g}{unit}"
-
-    def _in_range(self, number: float) -> bool:
-        return self.low <= (abs(number) if self.signed else number) <= self.high
 
     def _refusal(self, value: object, name: str) -> str:
         unit = f" {self.unit}" if self.unit else ""

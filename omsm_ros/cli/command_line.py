@@ -39,7 +39,7 @@ from omsm_ros.pipelines.progress import refresh_in_thread, state_progress, state
 from omsm_ros.quantities import SEED, TIME_LAPSE, shown
 
 if TYPE_CHECKING:
-    from omsm_ros.cli.command import CliCommand, Facts
+    from omsm_ros.cli.command import Facts
 
 # Commands that end sooner show no elapsed time.
 _DELAY_S = 1.0
@@ -198,13 +198,6 @@ omsm: on-machine surface measurement, corrected for the dynamic error of machine
 'omsm --help' lists all commands, 'omsm COMMAND --help' the options of one."""
 
 
-def _command(word: str) -> CliCommand:
-    """Return the command ``word``, and load only its module."""
-    with interruptible():
-        module = importlib.import_module(f"omsm_ros.cli.{WORDS[word].module}")
-    return next(command for command in module.COMMANDS if command.name == word)
-
-
 def _by_task() -> str:
     """Return the commands with their help, grouped by task."""
     lines = []
@@ -241,7 +234,9 @@ def _declare(word: str, sub: argparse.ArgumentParser) -> None:
     if word == DEMO:
         _declare_demo(Arguments(sub, word))
         return
-    command = _command(word)
+    with interruptible():  # only the module of this command is loaded
+        module = importlib.import_module(f"omsm_ros.cli.{WORDS[word].module}")
+    command = next(command for command in module.COMMANDS if command.name == word)
     sub.set_defaults(run=command)
     command.declare(Arguments(sub, word))
 
@@ -291,7 +286,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         say_lines(_NEXT_STEPS)
         return DONE
     try:
-        _check_words(given)
         own, passed_on = _split(given)
         named = [a for a in own if a in WORDS][:1]
         args = parser_of(named).parse_args(own)
@@ -342,17 +336,16 @@ def _report_internal_error(err: Exception) -> int:
     return BAD_INPUT if known else DEFECT
 
 
-def _check_words(given: list[str]) -> None:
-    """Raise ConfigurationError for a null character, or an option without a value."""
+def _split(given: list[str]) -> tuple[list[str], list[str]]:
+    """Return the arguments before and after "--" of a command that passes the latter on.
+
+    Raises ConfigurationError for a null character, or an option without a value.
+    """
     for word in given:
         if word.startswith("--") and word.endswith("=--"):  # argparse reads it as an empty list
             raise ConfigurationError(f"option {shown(word)} has no value; give one")
         if "\0" in word:
             raise ConfigurationError(f"argument {shown(word)} holds a null character; leave it out")
-
-
-def _split(given: list[str]) -> tuple[list[str], list[str]]:
-    """Return the arguments before and after "--" of a command that passes the latter on."""
     if given[0] not in FORWARD_ARGUMENTS or "--" not in given:
         return given, []
     place = given.index("--")

@@ -25,15 +25,7 @@ class Model(NamedTuple):
     emulator: str = ""
 
 
-def _from_other_packages() -> dict[str, Model]:
-    """Return the probes that installed packages offer."""
-    emulators = {point.name: point.value for point in entry_points(group=EMULATORS_GROUP)}
-    return {
-        point.name: Model(point.value, emulators.get(point.name, ""))
-        for point in entry_points(group=DRIVERS_GROUP)
-    }
-
-
+_EMULATORS = {point.name: point.value for point in entry_points(group=EMULATORS_GROUP)}
 _OWN_PROBES = {
     "six_channel": Model(".six_channel.device:make_binary", ".six_channel.emulator:BINARY"),
     "six_channel_text": Model(".six_channel.device:make_text", ".six_channel.emulator:TEXT"),
@@ -45,8 +37,11 @@ _OWN_PROBES = {
         ".micro_epsilon.device:make_ethernet", ".micro_epsilon.emulator:ETHERNET"
     ),
 }
-PROBES = _from_other_packages() | _OWN_PROBES
-"""Ours stay: a package cannot replace one of them."""
+PROBES = {
+    point.name: Model(point.value, _EMULATORS.get(point.name, ""))
+    for point in entry_points(group=DRIVERS_GROUP)
+} | _OWN_PROBES
+"""Those of installed packages and ours, of which a package cannot replace any."""
 REFERENCES = {
     "capancdt": Model(".micro_epsilon.capancdt_device:make", ".micro_epsilon.emulator:CAPACITIVE"),
     "analog": Model(".analog.device:make_reference"),

@@ -164,7 +164,8 @@ class _Copy:
             self._schemas[record.id] = number, record.name
         elif isinstance(record, Channel) and record.id not in self._channels:
             schema, kind = self._schemas[record.schema_id]
-            if record.metadata.get(_TYPE_HASH) not in (None, _hash_of(kind)):
+            ours = typestore().hash_rihs01(kind) if kind in TOPIC_TYPES.values() else None
+            if record.metadata.get(_TYPE_HASH) not in (None, ours):
                 kind = ""  # of another definition, so messages cannot be checked
             number = self._writer.register_channel(
                 record.topic, record.message_encoding, schema, record.metadata
@@ -196,11 +197,6 @@ class _Copy:
             self._made.lost.append(f"{self._path.name}: {what}")
         else:
             self._made.unnamed += 1
-
-
-def _hash_of(kind: str) -> str | None:
-    """Return the hash of one of our types; None for others."""
-    return typestore().hash_rihs01(kind) if kind in TOPIC_TYPES.values() else None
 
 
 def _check_records(data: bytes) -> None:

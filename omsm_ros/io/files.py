@@ -144,7 +144,8 @@ def atomic_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
         if target.exists() and not target.is_file():  # replacing /dev/null would break the machine
             raise FileExistsError(None, "it is a folder, a device or a pipe")
         part = temporary_sibling(target)
-        with open(part, mode, opener=_new_file) as stream:
+        new = os.O_EXCL | os.O_NOFOLLOW
+        with open(part, mode, opener=lambda name, how: os.open(name, how | new, 0o666)) as stream:
             yield stream
         os.replace(part, target)
     except (OSError, ValueError) as err:
@@ -175,10 +176,6 @@ def temporary_sibling(target: Path) -> Path:
     """Return a random name in the folder of ``target``."""
     # Not derived from the target's name, which may already have the greatest length.
     return target.with_name(f".{secrets.token_hex(8)}.part")
-
-
-def _new_file(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_EXCL | os.O_NOFOLLOW, 0o666)
 
 
 def save_bytes(path: Path | str, content: bytes) -> None:

@@ -352,8 +352,4 @@ def message_folder() -> Path:
 def bag_messages() -> Messages:
     """Return message classes for writing bags without ROS."""
     types = typestore().types
-    return Messages({name.split("/")[-1]: types[name] for name in _MESSAGES}, _bag_sequence)
-
-
-def _bag_sequence(values: ArrayLike, dtype: DTypeLike) -> Any:
-    return np.ascontiguousarray(values, dtype)
+    return Messages({name.split("/")[-1]: types[name] for name in _MESSAGES}, np.ascontiguousarray)

@@ -273,7 +273,7 @@ def _circles(out: Path, seed: int) -> Done:
             compared(f"{name}: amplitude, rms", quantity(rms, "m"), rms, ours, "m",
                      "the exposure of 1 ms averages the marks" if rpm > 10 else "marks of 11 nm"),
             compared(f"{name}: peak at a wavelength of", quantity(peak, "m"), peak, wavelength, "m",
-                     _named(scan)),
+                     ", ".join(sorted({row.kind for row in scan.named})) or "no line"),
         ]  # fmt: skip
     rows += _texture_rows(scans, options)
     title = "Marks at four speeds (Fig. 10, Table 1)"
@@ -381,11 +381,6 @@ def _figure_11(made: Mapping[str, Recording], scans: Sequence[SpectrumOfScan]) -
                 {"": psd(heights[n] / NANOMETRE_M, 1e-3)}, log="xy")
           for n, at in zip(names, "ef", strict=True)),
     )  # fmt: skip
-
-
-def _named(scan: SpectrumOfScan) -> str:
-    found = sorted({row.kind for row in scan.named})
-    return ", ".join(found) or "no line"
 
 
 def _spectrum_page(

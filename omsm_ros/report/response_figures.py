@@ -170,7 +170,8 @@ def step_response(
     made, axes = style.figure(6.1, 5.6, rows=2, sharex=True, height_ratios=(1.25, 1))
     upper, lower = axes[:, 0]
     edge = encoder[window]
-    since = (time[window] - time[window][_start(edge)]) / MILLISECOND_S
+    begin = int(np.argmax(np.abs(edge - edge[0]) > 0.01 * np.ptp(edge)))
+    since = (time[window] - time[window][begin]) / MILLISECOND_S
     seen = probe[window] - np.median(probe[window] - edge)
 
     def draw(where: Axes, value: FloatArray, colour: str, text: str, line: Any = "-") -> None:
@@ -188,8 +189,3 @@ def step_response(
     style.legend_above(upper)
     style.legend_above(lower)
     return made
-
-
-def _start(edge: FloatArray) -> int:
-    moved = np.abs(edge - edge[0]) > 0.01 * np.ptp(edge)
-    return int(np.argmax(moved))

@@ -138,7 +138,11 @@ def move(plant: Plant, motion: Motion, grid: TimeGrid) -> Movement:
     grid and of second order for a smooth motion. The delay shifts the time of the command; a step
     off the grid has an error of up to half a substep.
     """
-    servo, both = plant.servo, _series(plant.servo, plant.dynamics)
+    servo, multiply = plant.servo, np.polynomial.polynomial.polymul
+    both = TransferFunction(
+        np.asarray(multiply(servo.numerator, plant.dynamics.numerator), np.float64),
+        np.asarray(multiply(servo.denominator, plant.dynamics.denominator), np.float64),
+    )
     return Movement(
         _through_system(servo, 0.0, motion, grid),
         _through_system(both, plant.dynamics.delay, motion, grid),
@@ -167,14 +171,6 @@ def _through_system(
 def _command(motion: Motion, begin: float, count: int, step: float) -> FloatArray:
     """Return the commanded Z in the middle of ``count`` steps [s] from ``begin`` [s]."""
     return motion.positions(begin + (np.arange(count, dtype=np.float64) + 0.5) * step).z
-
-
-def _series(first: TransferFunction, second: TransferFunction) -> TransferFunction:
-    multiply = np.polynomial.polynomial.polymul
-    return TransferFunction(
-        np.asarray(multiply(first.numerator, second.numerator), np.float64),
-        np.asarray(multiply(first.denominator, second.denominator), np.float64),
-    )
 
 
 def _zero_order_hold_sections(system: TransferFunction, step: float) -> FloatArray:

@@ -40,7 +40,9 @@ class CheckedNumbers:
             value = getattr(self, field.name)
             if isinstance(value, bool) or not isinstance(value, int | float):
                 continue
-            limit = LONGEST_LAG_S if field.name in self.lags else _limit(field.name)
+            ends = (most for unit, most in _LIMITS.items() if field.name.endswith(unit))
+            limit = next(ends, float(np.finfo(np.float64).max))
+            limit = LONGEST_LAG_S if field.name in self.lags else limit
             least = -limit
             if field.name in self.positive or field.name in self.not_negative:
                 least = 0.0
@@ -51,11 +53,6 @@ class CheckedNumbers:
                     f"{type(self).__name__}: {field.name} is {value!r}, expected {expected} from "
                     f"{least:g} to {limit:g}; check its unit"
                 )
-
-
-def _limit(name: str) -> float:
-    ends = (limit for unit, limit in _LIMITS.items() if name.endswith(unit))
-    return next(ends, float(np.finfo(np.float64).max))
 
 
 def is_default(record: Any) -> bool:

@@ -197,7 +197,8 @@ def _moved(
 
 
 def _latency(found: SelfCalibration, lag: float) -> Latency:
-    source = REVERSAL if _same(np.abs(found.speeds)) else SPEEDS
+    size = np.abs(found.speeds)
+    source = REVERSAL if np.ptp(size) < _SAME_SPEED * np.max(size) else SPEEDS
     _, structure = found.structure
     # The part of the uncertainty that the covariance of the dynamics does not contain.
     structural_uncertainty = float(np.sqrt(max(structure**2 - found.covariance[LAG, LAG], 0.0)))
@@ -220,10 +221,6 @@ def _latency(found: SelfCalibration, lag: float) -> Latency:
         source=source,
         reason=str(Notice("adjustment.origin", scans=len(speeds), speeds=speeds)),
     )
-
-
-def _same(speeds: FloatArray) -> bool:
-    return bool(np.ptp(speeds) < _SAME_SPEED * np.max(speeds))
 
 
 def _entries(found: SelfCalibration) -> dict[str, object]:

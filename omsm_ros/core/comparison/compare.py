@@ -233,7 +233,8 @@ def compare_measurements_of_part(
         if errors is None
     )
     sides = (_side(halves[0], one, agreement), _side(halves[1], other, agreement))
-    shared = _shared(a.points, b.points, matched, side)
+    own = min(occupied(half.points.x, half.points.y, side) for half in (a, b))
+    shared = min(float(np.sum(matched.filled)) / own, 1.0)
     reservations = _reservations(sides, matched)
     return Comparison(
         matched=matched,
@@ -315,8 +316,3 @@ def _lateral_shift(matched: Matched) -> tuple[Notice, ...]:
         return ()
     height = float(np.ptp(matched.a))
     return (Notice("comparison.whole_heights", height=height, shift=MICROMETRE_M, rms=opened),)
-
-
-def _shared(a: MeasuredPoints, b: MeasuredPoints, matched: Matched, side: float) -> float:
-    own = min(occupied(points.x, points.y, side) for points in (a, b))
-    return min(float(np.sum(matched.filled)) / own, 1.0)

@@ -126,7 +126,8 @@ def match(a: LocalQuadratic, b: LocalQuadratic, grid: HeightGrid, dofs: Sequence
         seen = _resampled(here, b, grid, moved)
         step = seen.step()
         lateral_step = {name: step.pop(name) for name in _LATERAL if name in step}
-        if _is_converged(lateral_step, grid.dx, float(np.ptp(x))):
+        reach = {"x": grid.dx, "y": grid.dx, "clocking": 2 * grid.dx / float(np.ptp(x))}
+        if all(abs(value) < _SETTLED * reach[name] for name, value in lateral_step.items()):
             return replace(seen.levelled(step), refused=refused)
         moved |= {name: moved[name] + value for name, value in lateral_step.items()}
     raise DataError("comparison.not_converged")
@@ -213,11 +214,6 @@ def _independent_part(column: FloatArray, others: Sequence[FloatArray]) -> Float
         return column
     design = np.stack(others, axis=1)
     return np.asarray(column - design @ least_squares(design, column, _SINGULAR))
-
-
-def _is_converged(lateral_step: dict[str, float], place: float, extent: float) -> bool:
-    reach = {"x": place, "y": place, "clocking": 2 * place / extent}
-    return all(abs(value) < _SETTLED * reach[name] for name, value in lateral_step.items())
 
 
 def _heights_at(heights: LocalHeights, place: BoolArray) -> LocalHeights:

@@ -133,7 +133,9 @@ class Corrector:
         block = joined(blocks)
         motion = self._filter_for(block)
         if (arrival := self._axes.new(block, blocks)) is not None:
-            for run in motion.push(_axes_run(block, arrival)):
+            values = np.array([block.x, block.y, block.z, block.b, block.c], np.float64)
+            whole = SampleRun.of(block, arrival, np.zeros(len(block), np.uint8), values)
+            for run in motion.push(whole):
                 self._pairing.axes.push(run)
             self._join()
             self._pairing.axes.limit(self._most_pending(block))
@@ -304,11 +306,6 @@ def latency_in_use(calibration: Calibration, options: CorrectionOptions) -> floa
     """Return the delay of X, Y, B and C [s]: the stated one, else the calibration's latency."""
     stated = options.probe_latency
     return calibration.latency.delay_s if stated is None else stated
-
-
-def _axes_run(block: AxisBlock, arrival: Arrival) -> SampleRun:
-    values = np.array([block.x, block.y, block.z, block.b, block.c], np.float64)
-    return SampleRun.of(block, arrival, np.zeros(len(block), np.uint8), values)
 
 
 def _distance_run(block: DistanceBlock, arrival: Arrival) -> SampleRun:

@@ -267,14 +267,12 @@ class MotionFilter:
         if self.pending < self._start_samples:
             return []
         waiting, self._waiting = self._waiting, []
-        self._start(np.concatenate([w.values for w in waiting], axis=1)[:, : self._start_samples])
-        return [self._filtered(w) for w in waiting]
-
-    def _start(self, first: FloatArray) -> None:
+        first = np.concatenate([w.values for w in waiting], axis=1)[:, : self._start_samples]
         for bank in self._banks:
             bank.start(first)
         for axis, recursion in self._lateral.items():
             recursion.start(past_motion(first[axis].copy()))
+        return [self._filtered(w) for w in waiting]
 
     def _filtered(self, run: SampleRun) -> SampleRun:
         out = np.empty((self._outputs, len(run)))

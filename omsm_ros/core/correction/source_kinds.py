@@ -90,11 +90,6 @@ def _curve_components(position: FloatArray, parameters: Parameters) -> FloatArra
     return components(smooth(length), position)
 
 
-def _across_z(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return the fields of an unknown curve over Z, along X."""
-    return np.stack([_across(p, bow, 0.0) for bow in _curve_components(p.z, parameters)])
-
-
 def _phases(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return both phases of a wave of unknown phase."""
     return np.cos(angle), np.sin(angle)
@@ -257,7 +252,8 @@ KINDS: dict[str, SourceKind] = {
     ),
     "straightness_z": SourceKind(
         _METRES,
-        _across_z,
+        # The fields of an unknown curve over Z, along X.
+        lambda p, own: np.stack([_across(p, bow, 0.0) for bow in _curve_components(p.z, own)]),
         _CORRELATED,
         _LENGTH_OPTIONAL,
         needs_slope=True,

@@ -114,7 +114,9 @@ def _series(zeros: ComplexArray, poles: ComplexArray) -> _StateSpace:
 def _ratios(zeros: ComplexArray, poles: ComplexArray) -> list[tuple[FloatArray, FloatArray]]:
     pairs, reals = _split(zeros)
     found = []
-    for group in _by_two(poles):
+    of_poles, real = _split(poles)
+    # Real poles by two, the last alone where there is one more.
+    for group in [*of_poles, *(real[i : i + 2] for i in range(0, len(real), 2))]:
         if len(group) == 2 and pairs:
             taken = pairs.pop(0)
         else:
@@ -128,12 +130,6 @@ def _split(roots: ComplexArray) -> tuple[list[ComplexArray], ComplexArray]:
     ordered = roots[np.argsort(abs(roots))]
     pairs = [np.array([root, np.conj(root)]) for root in ordered if root.imag > 0]
     return pairs, ordered[ordered.imag == 0]
-
-
-def _by_two(roots: ComplexArray) -> list[ComplexArray]:
-    """Return conjugate pairs, then real roots by two, the last alone where there is one more."""
-    pairs, real = _split(roots)
-    return [*pairs, *(real[i : i + 2] for i in range(0, len(real), 2))]
 
 
 def _expanded(roots: ComplexArray) -> FloatArray:

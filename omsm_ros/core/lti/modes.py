@@ -91,16 +91,13 @@ def mode_entries(
     units = {"frequency": "_hz", "damping": "", "residue": "_per_s2"}
     return [
         {
-            f"{name}{kind}{unit}": _finite(getattr(mode, f"{name}{kind}"))
+            f"{name}{kind}{unit}": value if value is not None and np.isfinite(value) else None
             for name, unit in units.items()
             for kind in ("", "_uncertainty")
+            for value in [getattr(mode, f"{name}{kind}")]
         }
         for mode in known_modes(dynamics, covariance)
     ]
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and np.isfinite(value) else None
 
 
 def modal_remainder(dynamics: TransferFunction, up_to: float) -> float | None:

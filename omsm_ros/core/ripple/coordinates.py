@@ -53,24 +53,16 @@ def fourier_sum(
     total = np.zeros(grid)
     for offset in range(_WIDTH):
         cell = first + offset
-        weight = _kernel(position - cell)
+        inside = np.maximum(1 - (2 * (position - cell) / _WIDTH) ** 2, 0.0)
+        weight = special.i0(_BETA * np.sqrt(inside))
         total += np.bincount(cell % grid, values * weight, minlength=grid)
     spectrum = np.fft.rfft(total)[:count]
     # The grid starts at place[0], so the phases are shifted back to zero.
     k = np.arange(count)
     turned = np.exp(-2j * np.pi * spacing * place[0] * k)
-    return np.asarray(spectrum * turned / _kernel_transform(k / grid), np.complex128)
-
-
-def _kernel(distance: FloatArray) -> FloatArray:
-    inside = np.maximum(1 - (2 * distance / _WIDTH) ** 2, 0.0)
-    return np.asarray(special.i0(_BETA * np.sqrt(inside)))
-
-
-def _kernel_transform(frequency: FloatArray) -> FloatArray:
-    """Return the transform of the kernel over grid cells, at ``frequency`` [1/cell]."""
-    inside = np.sqrt(_BETA**2 - (np.pi * _WIDTH * frequency) ** 2)
-    return np.asarray(_WIDTH * np.sinh(inside) / inside)
+    # The transform of the kernel over grid cells.
+    inside = np.sqrt(_BETA**2 - (np.pi * _WIDTH * k / grid) ** 2)
+    return np.asarray(spectrum * turned / (_WIDTH * np.sinh(inside) / inside), np.complex128)
 
 
 @dataclass(frozen=True, eq=False)

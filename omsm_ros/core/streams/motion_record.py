@@ -138,10 +138,6 @@ def _positions(names: Sequence[str]) -> Values:
     return values
 
 
-def _reading(block: Any) -> tuple[FloatArray, BoolArray]:
-    return block.distance[np.newaxis], block.ok
-
-
 @dataclass(frozen=True, eq=False)
 class _Grid:
     """Axes (a, n) on the counts of one session from ``first`` on; NaN where not ``known`` (n,)."""
@@ -183,7 +179,7 @@ class _Grid:
         for run in self.runs:
             axes.stamps.add(run.session, run.first, run.stamp_ns)
             pairing.axes.push(run)
-        for run in _runs(blocks, _reading, stream):
+        for run in _runs(blocks, lambda block: (block.distance[np.newaxis], block.ok), stream):
             pairing.distance.push(run)
         seen, ok = np.full(len(self), np.nan), np.zeros(len(self), np.bool_)
         for axis, reading in chain(pairing.pairs(), pairing.end()):

@@ -88,18 +88,15 @@ class RunningScatter:
         self._samples, self._heights = samples[-_ORDER:], heights[-_ORDER:]
         neighbours = samples[_ORDER:] - samples[:-_ORDER] == _ORDER
         sizes = np.abs(np.diff(heights, _ORDER))[neighbours] * (_SIGMA_OF_MEAN_SIZE / _GAIN)
-        running = self._running(sizes)
+        # The running mean of the sizes, before the first and after each of them.
+        total, weight = self._faded(sizes, 0), self._faded(np.ones(len(sizes)), 1)
+        running = total / np.maximum(weight, np.finfo(np.float64).tiny)
         # The scatter at a height comes from the differences up to it, also of earlier blocks.
         seen = np.zeros(len(samples), np.int64)
         seen[_ORDER:] = np.cumsum(neighbours)
         scatter = running[seen[before:]]
         exceeds = scatter > max(_EXCEEDS * self._expected, _ROUNDING_M)
         return np.where(exceeds, scatter**2 - self._expected**2, 0.0)
-
-    def _running(self, sizes: FloatArray) -> FloatArray:
-        """Return the running mean before ``sizes`` (n,) and after each of them, (n + 1,)."""
-        total, weight = self._faded(sizes, 0), self._faded(np.ones(len(sizes)), 1)
-        return np.asarray(total / np.maximum(weight, np.finfo(np.float64).tiny), np.float64)
 
     def _faded(self, values: FloatArray, k: int) -> FloatArray:
         """Return the k-th decaying sum before ``values`` (n,) and after each of them, (n + 1,)."""

@@ -144,6 +144,7 @@ class TriggerSlipDetector:
 
     sessions: of axes and distance, whose pairs are judged
     found: the last slip, also if it has ended; None if there was none
+    same_stamps: both streams carry the stamps of one device, which latches both
     """
 
     def __init__(self, axes: StampLine, distance: StampLine, trigger: CommonTrigger) -> None:
@@ -156,8 +157,7 @@ class TriggerSlipDetector:
         self.sessions, self._start = sessions, first
         self._state = TriggerSlip()
         self._judged, self._since, self._period_ns = -1, 0.0, 1.0
-        # True until the first verdict; True while both streams carry the stamps of one driver.
-        self._starting, self._common = True, False
+        self._starting, self.same_stamps = True, False  # until the first verdict
         # Per stream: number of stamps, and the last block that began where stamps agree.
         self._stamps, self._shown = [0, 0], [first, first]
         # Count up to which a verdict found no slip; last count with a stamp that is off.
@@ -170,11 +170,6 @@ class TriggerSlipDetector:
         # Net step of both streams [samples], its count, the skew before it [ns]; least step [ns].
         self._stepped, self._stepped_at, self._before_step = 0, first, 0.0
         self._least_steps, self._begun_at = [math.inf, math.inf], [first, first]
-
-    @property
-    def same_stamps(self) -> bool:
-        """True if both streams carry the same stamps, because one device latches both."""
-        return self._common
 
     @property
     def state(self) -> TriggerSlip:
@@ -199,7 +194,7 @@ class TriggerSlipDetector:
             line.advance(session, first - 1)
         while (count := self._next(end)) < end:
             pairs = zip(self._lines, sessions, strict=True)
-            if self._common or any(
+            if self.same_stamps or any(
                 line.step_to(s, count, period_ns) >= PAUSE_NS for line, s in pairs
             ):
                 yield count, self.end()
@@ -212,7 +207,7 @@ class TriggerSlipDetector:
                 yield self._agreed_until(count, period_ns), False
         pairs = zip(self._lines, sessions, strict=True)
         stamped = all(line.stamp_of(s, first, period_ns) is not None for line, s in pairs)
-        if self._common or self._state.samples or not stamped:
+        if self.same_stamps or self._state.samples or not stamped:
             yield end, bool(self._state.samples)
 
     def end(self) -> bool:
@@ -254,7 +249,7 @@ class TriggerSlipDetector:
         begun = axes.advance(a, count), distance.advance(d, count)
         skew = axes.stamp_difference(distance, self.sessions, period_ns)
         if skew is None:
-            self._common = False
+            self.same_stamps = False
             return
         self._period_ns, per_s = period_ns, NANOSECONDS_PER_S / period_ns
         self._note_step(count, steps)
@@ -278,7 +273,7 @@ class TriggerSlipDetector:
     def _note(self, count: int, skew: float, begun: tuple[bool, bool], off: bool) -> None:
         """Keep the skew of one stamp for the streams whose blocks have ``begun`` there."""
         first = not any(self._stamps)
-        self._common = abs(skew) <= _SAME_NS and (first or self._common)
+        self.same_stamps = abs(skew) <= _SAME_NS and (first or self.same_stamps)
         for stream in (0, 1):
             if begun[stream]:
                 self._stamps[stream] += 1

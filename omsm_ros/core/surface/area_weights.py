@@ -51,7 +51,9 @@ def area_weights(
         weights = _ways(along)
         return np.asarray(weights / np.mean(weights), np.float64)
     angle = np.unwrap(np.arctan2(y, x))
-    turned = _turns(angle) if outline is None and _is_path(angle) else 0.0
+    turned = 0.0
+    if outline is None and len(angle) and _is_path(angle):
+        turned = float(abs(angle[-1] - angle[0]) / (2 * np.pi))
     share = np.ones(len(x))
     if turned >= _LEAST_TURNS:
         group, area = _rings(x, y, turned)
@@ -82,10 +84,6 @@ def _ways(along: FloatArray) -> FloatArray:
     ways = np.empty(len(along))
     ways[order] = (np.r_[0.0, steps] + np.r_[steps, 0.0]) / 2
     return ways
-
-
-def _turns(angle: FloatArray) -> float:
-    return float(abs(angle[-1] - angle[0]) / (2 * np.pi)) if len(angle) else 0.0
 
 
 def _is_path(angle: FloatArray) -> bool:

@@ -51,7 +51,6 @@ from omsm_ros.instruments.chrocodile.telegram import (
     START_TIME,
     SYNC,
     Layout,
-    Records,
     unit_of,
 )
 from omsm_ros.instruments.emulator import Instrument, Measured
@@ -184,7 +183,8 @@ class ChrocodileEmulator(Instrument):
             records[str(number)] = column
         if not self._binary:
             return self._layout.lines(records)
-        return _pieces(records)
+        wire, size = records.tobytes(), records.dtype.itemsize
+        return [wire[i : i + size] for i in range(0, len(wire), size)]
 
     def _signal(
         self, number: int, measured: Measured, counters: np.ndarray, times_ns: np.ndarray
@@ -208,11 +208,6 @@ class ChrocodileEmulator(Instrument):
         if number == SAMPLE_COUNTER:
             return counters
         return np.zeros(len(measured))
-
-
-def _pieces(records: Records) -> list[bytes]:
-    wire, size = records.tobytes(), records.dtype.itemsize
-    return [wire[i : i + size] for i in range(0, len(wire), size)]
 
 
 # Samples in a packet.
@@ -246,7 +241,8 @@ class ChrocodilePacketEmulator(ChrocodileEmulator):
                 self._obey(message)
 
     def _obey(self, asked: PacketCommand) -> None:
-        words = (QUERY,) if asked.flags & PACKET_QUERY else tuple(map(_text, asked.values))
+        said = (f"{v:.9g}" if isinstance(v, int | float) else str(v) for v in asked.values)
+        words = (QUERY,) if asked.flags & PACKET_QUERY else tuple(said)
         text = self._answer(Request(b"", asked.name, words))
         flags = ERROR if text == _REFUSED else 0
         if asked.name == "VER" or flags:
@@ -289,10 +285,6 @@ def _number(word: str) -> Value:
         return int(word)
     except ValueError:
         return float(word)
-
-
-def _text(value: Value) -> str:
-    return f"{value:.9g}" if isinstance(value, int | float) else str(value)
 
 
 _DRIVER = {"encoders": "XYZUV"} | OWN_ENCODERS

@@ -258,7 +258,8 @@ class LineDecoder:
         """Return telegrams completed by ``data``, shape (n,); n may be 0."""
         self._received += len(data)
         *lines, tail = (self._tail + data).split(b"\n")
-        good = [line for line in lines if self._well_formed(line)]
+        short = (line for line in lines if len(line) < MAX_TELEGRAM_BYTES)
+        good = [line for line in short if self._line.fullmatch(line) is not None]
         shape = len(good), len(self._layout.signals)
         values = np.fromstring(b" ".join(good), sep=" ").reshape(shape)
         fits = self._fitting(values)
@@ -282,9 +283,6 @@ class LineDecoder:
         """Return the counts of bytes, telegrams, and damaged lines."""
         counts = {"telegrams": self._telegrams, "losses_of_sync": self._losses}
         return WireCounts(self._received, self._kept, len(self._tail), **counts)
-
-    def _well_formed(self, line: bytes) -> bool:
-        return len(line) < MAX_TELEGRAM_BYTES and self._line.fullmatch(line) is not None
 
     def _fitting(self, values: FloatArray) -> NDArray[np.bool_]:
         """Return which rows of ``values`` (n, signals) fit the signals' types, shape (n,)."""

@@ -111,7 +111,9 @@ class TextTable(ForeignTable):
         self._first_cells = self._cells(body[0]) if body else []
         self.names = head if form.named else [f"[{i}]" for i in range(len(head))]
         for line in reversed(lines[place + 1 : self._first_row] if form.named else []):
-            self.units.update(self._stated_units(line))
+            cells = [cell.strip().strip("[]()").strip() for cell in self._named_cells(line)]
+            named = zip(self.names, cells, strict=False)
+            self.units.update({name: unit for name, unit in named if unit in WORDS})
 
     def hint(self, names: Sequence[str]) -> str:
         """Return the place of the line of names, or the delimiter of its cells."""
@@ -182,11 +184,6 @@ class TextTable(ForeignTable):
         if '"' in line and self._form.delimiter != " ":
             cells = next(csv.reader([line], delimiter=self._form.delimiter), cells)
         return [micro_sign(cell.strip().strip('"')) for cell in cells]
-
-    def _stated_units(self, line: str) -> dict[str, str]:
-        """Return the units that a line below the names holds, as mm, [mm] or (mm)."""
-        cells = [cell.strip().strip("[]()").strip() for cell in self._named_cells(line)]
-        return {n: unit for n, unit in zip(self.names, cells, strict=False) if unit in WORDS}
 
     def _pieces(
         self, names: Sequence[str], dates: frozenset[str]
