@@ -190,7 +190,7 @@ _EXCLUDED, _POSSIBLE, _CERTAIN = 6.0, 1.0, 12.0
 # The latest spans, in which no step can be excluded.
 _OPEN = 5
 # Without a reference for longer, it is the scatter of the arrivals that hides missed triggers [s].
-_SCATTERED_S = 5.0
+_SCATTERED_S = 8.0
 # Without a reference, so short a time before a pause is taken to be without missed triggers [s].
 _UNKNOWN_S = 1.0
 # The last sample of a portion may be nearly a period old: the lateness that confirms [period].
@@ -267,7 +267,7 @@ class MissedTriggerDetector:
 
     @property
     def seen_from(self) -> int:
-        """Return the least number of missed triggers that exceeds the scatter of the arrivals."""
+        """Return the least number of missed triggers that arrivals show; 0 = none do."""
         return self._reference.seen_from
 
     def forget_missed(self) -> int:
@@ -362,10 +362,11 @@ class _Reference:
             return
         self._judged = float(begin[-1])
         _, drift, rest, _ = _line_below(begin - begin[-1], late)
-        in_lapse = abs(drift) > _GROSS
-        if not self.proven and (in_lapse or waited > _SCATTERED_S):
+        if not self.proven and abs(drift) > _GROSS and waited > _GROSS_SPAN_S:
+            self._limit, self.seen_from = math.inf, 0  # played in time lapse
+        elif not self.proven and waited > _SCATTERED_S:
             self._set_limit(rest)
-        missed = 0 if in_lapse else self._settle(known)
+        missed = self._settle(known) if self.seen_from else 0
         if missed == 0 or (missed and self.proven):
             self.proven, self.confirmed = True, self._judged
             self._set_line(len(begin))
@@ -384,7 +385,7 @@ class _Reference:
         for at in range(max(first, 1), len(late)):
             apart = float(rest[at:].min()), float(level[at:].min() - level[:at].min())
             shown = {math.floor(each / self._period + _AGE_PERIODS) for each in apart}
-            for missed in {max(n + k, self.seen_from) for n in shown for k in (0, 1)}:
+            for missed in {max(n, m) for n in shown for m in (1, n + 1, self.seen_from)}:
                 shifted = np.append(late[:at], late[at:] - missed * self._period)
                 *_, rests, unlikely = _line_below(since, shifted)
                 found.append((at, missed, _edge(rests / self._period) - unlikely - none))
@@ -395,8 +396,8 @@ class _Reference:
             moved = [(b, y - best * self._period) for b, y in self._earliest[at:]]
             self._earliest[at:] = moved
             return best
-        possible = set(steps[likely > -_EXCLUDED])
-        last = max(set(steps) - possible, default=0)
+        possible = steps[(likely > -_EXCLUDED) & (numbers >= self.seen_from)]
+        last = max(set(steps) - set(possible), default=0)
         return 0 if most < _POSSIBLE and last >= len(late) - _OPEN else None
 
     def _set_line(self, known: int) -> None:
@@ -413,8 +414,8 @@ class _Reference:
         """Set the limit by the scatter of the rests above the line (n,), which no step explains."""
         windows = np.sort(sliding_window_view(rest, _WINDOW), axis=1)
         usual = _USUAL * float(np.median(windows[:, 1] - windows[:, 0]))
-        usual = max(_LATE_PERIODS * self._period, usual + _AGE_PERIODS * self._period)
-        self._limit = min(usual, most)
+        self.seen_from = max(math.ceil(usual / self._period + 2 * _AGE_PERIODS), 1)
+        self._limit = min((self.seen_from - _AGE_PERIODS) * self._period, most)
         self.seen_from = math.ceil(self._limit / self._period)
 
 
