@@ -392,7 +392,7 @@ class _Reference:
         steps, numbers, likely = np.array(found).T
         at, best, most = found[int(np.argmax(likely))]
         other = likely[numbers != best].max(initial=0.0)
-        if most > _CERTAIN and most - other > (_CERTAIN if self.proven else _EXCLUDED):
+        if most > _CERTAIN and most - other > _EXCLUDED:
             moved = [(b, y - best * self._period) for b, y in self._earliest[at:]]
             self._earliest[at:] = moved
             return best

@@ -16,6 +16,9 @@ import two_counters
 
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.instruments.arrivals import MissedTriggerDetector
+from omsm_ros.instruments.blocks import BlockCutter, BlockSettings, Channels
+from omsm_ros.instruments.counting import SAMPLE, CountedRun
+from omsm_ros.instruments.emulator import AXIS_SCALING
 from omsm_ros.instruments.six_channel.device import (
     CsvSettings,
     CsvStreamDevice,
@@ -260,3 +263,67 @@ def test_what_the_arrivals_cannot_show_is_stated() -> None:
     for d, a in zip(due, np.maximum.accumulate(due + random.uniform(0, 0.1, 999)), strict=True):
         detector.confirms(float(d), UPTIME_S + float(a))
     assert detector.seen_from > 3
+
+
+def cut(
+    missed_at: float = np.inf, stall: float = np.inf, pause: float = np.inf, level: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, BlockCutter]:
+    """Return counts and true triggers of the samples of axes that a cutter hands over in 12 s.
+
+    Two triggers are missed. The host stands still for 0.5 s, or the trigger does.
+
+    level: mean delay of most arrivals by a host that is busy now and then [s]
+    """
+    random = np.random.default_rng(5)
+    cutter = BlockCutter(
+        BlockSettings(sample_period=PERIOD),
+        Channels(distance=False, axes=AXIS_SCALING, timed=False),
+    )
+    late = delays(random, level)
+    published, heard, read, now = [np.empty((2, 0), np.int64)], 0.0, 0, 0.0
+    for k, edge in enumerate(np.arange(1, 1200) * 0.01 + random.uniform(0, 1e-3, 1199)):
+        now = max(now, stall + 0.5 if stall <= edge < stall + 0.5 else edge + late[k])
+        taken = edge if edge < pause else max(edge - 0.5003, pause)
+        true = int(taken / PERIOD)
+        end = true - 2 * (taken > missed_at)
+        if end <= read:
+            continue
+        samples = np.zeros(end - read, SAMPLE)
+        counts = np.arange(read, end)
+        samples["counts"][:, 0] = counts + 2 * (counts >= missed_at / PERIOD)
+        run = CountedRun(samples, read, False)
+        at, after = UPTIME_S + now, now - heard > 0.2
+        for axes, _ in cutter.add([run], round(at * 1e9), at, after_silence=after):
+            triggers = np.rint(axes.x * AXIS_SCALING[0].counts_per_unit).astype(int)
+            published.append(np.array([np.arange(axes.first_sample, axes.end), triggers]))
+        heard, read = now, end
+    counts, triggers = np.concatenate(published, axis=1)
+    return counts, triggers, cutter
+
+
+@pytest.mark.parametrize("level", [0.0, 0.01])
+@pytest.mark.parametrize("at", [0.6, 5.9])
+def test_neither_the_start_nor_a_host_that_stands_still_hides_a_missed_trigger(
+    at: float, level: float
+) -> None:
+    counts, triggers, cutter = cut(missed_at=at, stall=6.0, level=level)
+    np.testing.assert_array_equal(counts, triggers)
+    assert cutter.missed == 2
+    assert counts[-1] > 9000
+
+
+def test_a_host_that_stands_still_costs_no_sample() -> None:
+    counts, triggers, cutter = cut(stall=6.0, level=0.005)
+    np.testing.assert_array_equal(counts, triggers)
+    assert (cutter.withheld, cutter.missed) == (0, 0)
+    assert len(counts) > 11_800
+
+
+@pytest.mark.parametrize(("at", "resumes"), [(np.inf, True), (5.0, False)])
+def test_after_a_pause_of_the_trigger_only_a_doubt_before_it_withholds(
+    at: float, resumes: bool
+) -> None:
+    counts, triggers, cutter = cut(missed_at=at, pause=5.6)
+    np.testing.assert_array_equal(counts, triggers)
+    assert (counts[-1] > 11_000) == resumes
+    assert cutter.unconfirmed != resumes
