@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -20,13 +19,12 @@ from omsm_ros.errors import DeviceError, NoSamplesError
 from omsm_ros.instruments.chrocodile.device import ChrocodileSettings, RefusedError
 from omsm_ros.instruments.chrocodile.dollar_device import ChrocodileDevice
 from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
-from omsm_ros.instruments.micro_epsilon.capancdt_device import CapaNcdtDevice, CapaNcdtSettings
 from omsm_ros.instruments.micro_epsilon.device import (
     ConfocalDtDevice,
     ConfocalDtEthernetDevice,
     ConfocalDtSettings,
 )
-from omsm_ros.instruments.scaling import AXES, ProbeReading
+from omsm_ros.instruments.scaling import AXES
 from omsm_ros.instruments.six_channel.device import (
     CsvSettings,
     CsvStreamDevice,
@@ -322,32 +320,6 @@ def test_a_flipped_bit_of_a_time_costs_nothing(bit: int) -> None:
     late = stamps - np.array(firsts) * 1e6
     assert np.ptp(late) < 30e6
     assert not flips
-
-
-def test_a_flipped_bit_in_the_header_of_a_block_makes_no_wrong_sample() -> None:
-    """Four frames of two channels are as long as eight of one: a channel bit may be the flipped."""
-    for bit in range(8 * 12, 8 * 32):
-        script = []
-        for n in range(10):
-            values = np.full((4, 2), 5, "<i4")
-            values[:, 0] = 1000 + 4 * n + np.arange(4)
-            head = struct.pack("<4sIIQIHHI", b"MEAS", 8010074, 77, 0b0101, 0, 4, 8, 4 * n)
-            script.append(bytearray(head + values.tobytes()))
-        script[5][bit // 8] ^= 1 << bit % 8
-        driver = CapaNcdtDevice(
-            Script(*map(bytes, script)),
-            CapaNcdtSettings(probe=ProbeReading(full_scale=1e-4), triggered=True),
-        )
-        driver.open()
-        found = []
-        for _ in script:
-            with suppress(DeviceError):  # it has no such channel
-                found += [pair.distance for pair in driver.poll(0.0)]
-        found += [pair.distance for pair in driver.close()]
-        numbers = np.concatenate([block.first_sample + np.arange(len(block)) for block in found])
-        counts = np.concatenate([b.distance for b in found]) / 1e-4 * 0xFFFFFF
-        np.testing.assert_allclose(counts, 1000.0 + numbers)
-        assert len(numbers) >= 32
 
 
 @pytest.mark.parametrize("bit", [0, 4, 17, 31])

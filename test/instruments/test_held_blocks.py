@@ -1,11 +1,16 @@
-"""Samples that wait for the next block keep their arrival time, and wait for a limited time."""
+"""Blocks of a controller: those that wait keep their arrival time; spoilt ones give no sample."""
 
 from __future__ import annotations
 
+import struct
+from contextlib import suppress
+
 import numpy as np
 
+from omsm_ros.errors import DeviceError
 from omsm_ros.instruments.micro_epsilon.capancdt_device import CapaNcdtDevice, CapaNcdtSettings
 from omsm_ros.instruments.micro_epsilon.protocol import MeasurementBlock, encode_block
+from omsm_ros.instruments.scaling import ProbeReading
 
 from .scripted_stream import Script
 
@@ -47,3 +52,29 @@ def test_blocks_seconds_apart_are_handed_over_one_by_one() -> None:
     arrivals = [t for k in range(6) for t in (1500.0 * (k + 1), 1500.0 * k + 2250)]
     found = stamps(wire, arrivals, 1.5)
     assert found == {k: 1500.0 * (k + 1) for k in range(6)}
+
+
+def test_a_flipped_bit_in_the_header_of_a_block_makes_no_wrong_sample() -> None:
+    """Four frames of two channels are as long as eight of one: a channel bit may be the flipped."""
+    for bit in range(8 * 12, 8 * 32):
+        script = []
+        for n in range(10):
+            values = np.full((4, 2), 5, "<i4")
+            values[:, 0] = 1000 + 4 * n + np.arange(4)
+            head = struct.pack("<4sIIQIHHI", b"MEAS", 8010074, 77, 0b0101, 0, 4, 8, 4 * n)
+            script.append(bytearray(head + values.tobytes()))
+        script[5][bit // 8] ^= 1 << bit % 8
+        driver = CapaNcdtDevice(
+            Script(*map(bytes, script)),
+            CapaNcdtSettings(probe=ProbeReading(full_scale=1e-4), triggered=True),
+        )
+        driver.open()
+        found = []
+        for _ in script:
+            with suppress(DeviceError):  # it has no such channel
+                found += [pair.distance for pair in driver.poll(0.0)]
+        found += [pair.distance for pair in driver.close()]
+        numbers = np.concatenate([block.first_sample + np.arange(len(block)) for block in found])
+        counts = np.concatenate([b.distance for b in found]) / 1e-4 * 0xFFFFFF
+        np.testing.assert_allclose(counts, 1000.0 + numbers)
+        assert len(numbers) >= 32
