@@ -14,7 +14,7 @@ from rclpy.task import Future
 from omsm_ros.errors import OmsmError
 from omsm_ros.nodes.memory import return_free_memory
 from omsm_ros.nodes.running import offer, refusing
-from omsm_ros.nodes.topics import every
+from omsm_ros.nodes.topics import REQUESTS_QOS, every
 
 T = TypeVar("T")
 
@@ -83,9 +83,9 @@ def serve_action(
         (handle.succeed if result.success else end)()
         return result
 
-    server = ActionServer(
-        node, kind, name, execute, cancel_callback=lambda _: CancelResponse.ACCEPT
-    )
+    queues = {f"{of}_service_qos_profile": REQUESTS_QOS for of in ("goal", "cancel", "result")}
+    accept = {"cancel_callback": lambda _: CancelResponse.ACCEPT}
+    server = ActionServer(node, kind, name, execute, **accept, **queues)
     undo.callback(server.destroy)
     undo.callback(ended.set)
 
