@@ -184,8 +184,7 @@ _FIRST_S, _FIRST_SPANS = 0.05, 40
 _SPANS, _LATEST = 50, 60
 # The least number of spans to be judged, and without a confirming arrival among them.
 _LEAST_SPANS, _SHOWING = 8, 3
-# Missed triggers are excluded, or likelier than this (log), and their number is certain, before
-# there is a reference and with it.
+# Missed triggers are excluded, not likelier than none, and of a certain number by this (log).
 _EXCLUDED, _POSSIBLE, _CERTAIN = 6.0, 1.0, 12.0
 # The latest spans, in which no step can be excluded.
 _OPEN = 5
@@ -392,7 +391,7 @@ class _Reference:
         steps, numbers, likely = np.array(found).T
         at, best, most = found[int(np.argmax(likely))]
         other = likely[numbers != best].max(initial=0.0)
-        if most > _CERTAIN and most - other > _EXCLUDED:
+        if most - other > _CERTAIN:
             moved = [(b, y - best * self._period) for b, y in self._earliest[at:]]
             self._earliest[at:] = moved
             return best
