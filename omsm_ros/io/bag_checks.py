@@ -39,7 +39,7 @@ MAX_CHUNK_BYTES = 128 * 1024**2
 MAX_MESSAGE_BYTES = 128 * 1024**2
 # The footer with its places and checksum, and the magic bytes (mcap.dev/spec, "Footer (op=0x02)").
 _RECORD_HEAD_BYTES, _CHECKED_END_BYTES, _END_BYTES = 9, 25, 37
-_MAX_METADATA_BYTES = 4 * 1024**2
+_MAX_METADATA_BYTES = 1024**2
 # A profile has 400 characters; a topic of a hundred publishers has a hundred of them.
 _LONGEST_QOS = 100_000
 # Chunks that overlap in time are held until their messages are in order; recorders overlap by one.

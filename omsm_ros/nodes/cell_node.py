@@ -13,9 +13,10 @@ from pathlib import Path
 import rclpy.utilities
 
 from omsm_ros.errors import ConfigurationError, one_line
+from omsm_ros.loading import exit_on_signal_while_loading
 from omsm_ros.nodes.managed import ARGUMENTS
 from omsm_ros.nodes.running import run
-from omsm_ros.nodes.start import NODES
+from omsm_ros.nodes.start import ENDING, NODES
 
 _CELL = "confocal_driver calibrator corrector"
 _OTHERS = ("replay", "player", "cell", "cell_demo")
@@ -43,7 +44,9 @@ def main() -> None:
     except (ConfigurationError, RuntimeError) as err:  # RuntimeError of invalid arguments for ROS
         print(f"cell: {one_line(err).split(', at ')[0]}", file=sys.stderr)
         sys.exit(_BAD_INPUT)
-    run(*(_maker(name) for name in names))
+    with exit_on_signal_while_loading(ENDING):
+        makers = [_maker(name) for name in names]
+    run(*makers)
 
 
 def shipped() -> Path:

@@ -1,5 +1,6 @@
 """Several nodes in one process, each with its own parameters."""
 
+import signal
 import sys
 
 import pytest
@@ -28,6 +29,19 @@ def test_each_node_has_its_file_and_the_arguments_of_the_user_prevail(monkeypatc
     assert given[:2] == ["--ros-args", "--params-file"]
     assert given[2].endswith("config/corrector.yaml")
     assert tuple(given[3:]) == ros
+
+
+def test_ctrl_c_while_the_nodes_load_is_an_orderly_end(monkeypatch):
+    make, found, before = cell_node._maker, [], signal.getsignal(signal.SIGINT)
+
+    def load(name):
+        found.append(signal.getsignal(signal.SIGINT))
+        return make(name)
+
+    monkeypatch.setattr(cell_node, "_maker", load)
+    started(monkeypatch, "--nodes", "corrector")
+    assert found[0].__qualname__.startswith("exit_on_signal_while_loading")
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 @pytest.mark.parametrize("name", ["corector", "cell", "replay"])

@@ -139,8 +139,7 @@ class Chrocodile(StreamDevice):
     @property
     def settings(self) -> dict[str, object]:
         """Return the settings that change a reading or its time: model, head, rate, lamp …"""
-        identity = self._identity
-        reported = {name: _value(identity[c]) for c, name in _DECISIVE.items() if c in identity}
+        reported = {n: _value(v) for c, v in self._identity.items() if (n := _DECISIVE.get(c))}
         chosen = {"latch": self._wanted.latch, "trigger": self._wanted.trigger}
         return reported | chosen if reported else {}
 
@@ -337,8 +336,8 @@ class Chrocodile(StreamDevice):
         return not found or set(self._selection) <= set(found)
 
     def _converted(self, batches: Sequence[Records]) -> Samples:
-        parts = [self._convert(records) for records in batches if len(records)]
-        return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
+        parts = (self._convert(records) for records in batches if len(records))
+        return np.concatenate([np.empty(0, SAMPLE), *parts])
 
     def _convert(self, records: Records) -> Samples:
         samples = np.zeros(len(records), SAMPLE)
