@@ -242,15 +242,16 @@ def analyse_form(
     bounded = [*[n for n, s in enumerate(sources) if s in bounds], *held]
     map_ = gathered.map(found, area_weights(x, y, even=even, outline=outline), bounded)
     zernike = _terms(map_, found)
-    cells, rest = GridCells.of(map_, even=even), without_terms(map_, found.disc, SECOND_ORDER)
+    cells = GridCells.of(map_, even=even)
     bands = bands_of(cells, *filters)
+    figures, rest = _figures(map_, gathered, found, outline, even)
     return FormResult(
         registration=found,
         aperture=outline,
         map=map_,
-        deviation=_figures(map_, rest, gathered, found, outline)
+        deviation=figures
         | optical_terms(map_, zernike)
-        | _textures((map_, rest), cells, bands, found, None if even else outline),
+        | _textures(map_, cells, rest, bands, found, None if even else outline),
         zernike=zernike,
         bands=bands,
         profiles=profiles(map_, found.disc),
@@ -262,18 +263,15 @@ def analyse_form(
 
 
 def _figures(
-    map_: DeviationMap,
-    rest: DeviationMap,
-    gathered: _Gathered,
-    found: Registration,
-    outline: Aperture,
-) -> dict[str, UncertainValue]:
-    """Return figures of the map;  rest: of it without its second order."""
+    map_: DeviationMap, gathered: _Gathered, found: Registration, outline: Aperture, even: bool
+) -> tuple[dict[str, UncertainValue], GridCells]:
+    """Return figures of the map, and the cells of it without its second order."""
+    rest = without_terms(map_, found.disc, SECOND_ORDER)
     fitted, square = best_fit(map_), np.average(map_.deviation**2, weights=map_.area)
     maps = [map_, fitted, rest, without_terms(map_, found.disc, POWER)]
     extents = extents_of_parts(maps, found.disc, outline, found.spacing)
     whole, robust, _ = extents[0]
-    return {
+    figures = {
         # Irregularity: the peak to valley without piston, tilts and power.
         "iso10110_B": extents[3][0],
         "peak_to_valley": whole,
@@ -291,18 +289,20 @@ def _figures(
         "point_noise": UncertainValue(map_.noise if map_.noise_known else None, None),
         "rms_before_fit": UncertainValue(found.before, None),
     }
+    return figures, GridCells.of(rest, even=even)
 
 
 def _textures(
-    maps: tuple[DeviationMap, DeviationMap],
+    map_: DeviationMap,
     cells: GridCells,
+    rest: GridCells,
     bands: Bands,
     found: Registration,
     outline: Aperture | None,
 ) -> dict[str, UncertainValue]:
-    """Return texture and slopes;  maps: of the part, and without its second order."""
-    points = without_terms(maps[0], found.disc, FORM)
-    formless, rest = (GridCells.of(part, even=outline is None) for part in (points, maps[1]))
+    """Return texture and slopes;  cells, rest: of the map, and of it without its second order."""
+    points = without_terms(map_, found.disc, FORM)
+    formless = GridCells.of(points, even=outline is None)
     # Without an S-filter the surface has waves that the cells do not resolve.
     resolved = cells.width == 0 or bands.s_filter is not None
     points = points if resolved else short_waves(points, formless, bands.l_filter)

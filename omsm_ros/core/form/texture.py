@@ -27,9 +27,9 @@ _NOISE_SEED = 21
 _LEAST_CELLS = 4.0
 # Weights of the cutoffs 1, √2, √3 for the figure at zero: by the first, the first two, all.
 _EXTRAPOLATED = np.array([[1.0, 0.0, 0.0], [2.0, -1.0, 0.0], [3.0, -3.0, 1.0]])
-# Draws of the noise; and share of the subtracted noise that is uncertain, where noise and form
-# do not add as squares.
-_DRAWS, _UNSURE = 4, 0.25
+# Images filtered at a time; draws of the noise; and share of the subtracted noise that is
+# uncertain, where noise and form do not add as squares.
+_AT_A_TIME, _DRAWS, _UNSURE = 8, 4, 0.25
 # The width of the cells does not change a cutoff of this number of them.
 _MANY_CELLS = 12.0
 # Limits of the bands, as shares of the longest side.
@@ -155,7 +155,7 @@ def texture(
     shown = [cells] if rest is None else [cells, rest]
     images = [np.concatenate([c.mean[np.newaxis], c.effects]) for c in shown]
     cutoffs = _cutoffs(cells, bands.s_filter)
-    *steep, levels = _planes(cells, [*images, formless.mean[np.newaxis]], cutoffs)
+    *steep, levels = _planes(cells, [*images, formless.mean[np.newaxis]], cutoffs, len(images))
     between = (bands.s_filter, bands.l_filter)
     surface = _band(formless, *between, levels) if points is None else _of_points(points)
     found = dict(zip(("Sa", "Sq", "Sz", "Ssk", "Sku"), surface.figures(_moments, 3), strict=True))
@@ -178,21 +178,26 @@ def _of_points(map_: DeviationMap) -> _FilteredBand:
     return _FilteredBand([level[:, even]], map_.effects[:, even], map_.noise_known)
 
 
-# Level and slopes of one image along x and y (3, 1 + draws + e, r, c), for each cutoff.
+# Slopes along x and y (2, 1 + draws + e, r, c) of an image, or its level (1, …), for each cutoff.
 _Planes = list[FloatArray]
 
 
 def _planes(
-    cells: GridCells, images: Sequence[FloatArray], cutoffs: Sequence[tuple[float, float]]
+    cells: GridCells, images: list[FloatArray], cutoffs: list[tuple[float, float]], steep: int = 0
 ) -> list[_Planes]:
-    """Return the planes of images (1 + e, r, c) and noise; of effects after the first cutoff."""
+    """Return the slopes of the first ``steep`` images (1 + e, r, c), the levels of the others.
+
+    With those of the noise; of the effects after the first cutoff only.
+    """
     noise, found = _noise(cells), [_Planes() for _ in images]
     for cutoff in cutoffs:
         fit = cells.planes(cutoff)
         of_noise = fit(noise)
-        for planes, image in zip(found, images, strict=True):
-            own = fit(image[:1] if planes else image)
-            planes.append(np.concatenate([own[:, :1], of_noise, own[:, 1:]], axis=1))
+        for k, (planes, image) in enumerate(zip(found, images, strict=True)):
+            rows, image = slice(k < steep, 3 if k < steep else 1), image[:1] if planes else image
+            few = np.split(image, range(_AT_A_TIME, len(image), _AT_A_TIME))
+            own = np.concatenate([fit(part)[rows] for part in few], axis=1)
+            planes.append(np.concatenate([own[:, :1], of_noise[rows], own[:, 1:]], axis=1))
     return found
 
 
@@ -201,7 +206,7 @@ def _slopes(cells: GridCells, planes: _Planes) -> list[UncertainValue]:
     chosen = cells.present & _neighboured(cells.present)
     if not np.any(chosen):
         return 2 * [UncertainValue(None, None)]
-    steep = [np.moveaxis(p[1:, :, chosen], 0, 1) for p in planes]
+    steep = [np.moveaxis(p[:, :, chosen], 0, 1) for p in planes]
     levels, effects = [s[: 1 + _DRAWS] for s in steep], steep[0][1 + _DRAWS :]
 
     def sizes(values: FloatArray) -> FloatArray:

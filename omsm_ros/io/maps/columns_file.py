@@ -180,7 +180,11 @@ def _columns(
             continue
         if role in stated:
             scales[role] = stated[role]
-            _agreed_until(units, role, stated[role], what)
+            if units is not None:
+                own = (
+                    (stated[role], units.height) if role in "xy" else (units.lateral, stated[role])
+                )
+                refuse_other(units, LengthUnits(*own), what)
         else:
             given = needed(units, what)
             scales[role] = given.lateral if role in "xy" else given.height
@@ -208,14 +212,6 @@ def _of_profile(header: list[str], what: str) -> dict[str, tuple[int, float | No
         found = {role: (k, name_and_unit(names[k])[1]) for k, role in enumerate(("x", "height"))}
         return found if any(unit for _, unit in found.values()) else {}
     return {}
-
-
-def _agreed_until(units: LengthUnits | None, role: str, stated: float, what: str) -> None:
-    """Raise FileError for a column whose name states another unit than ``units``."""
-    if units is None:
-        return
-    own = (stated, units.height) if role in "xy" else (units.lateral, stated)
-    refuse_other(units, LengthUnits(*own), what)
 
 
 def _roles(
