@@ -31,7 +31,7 @@ def impulse_response(inputs: FloatArray, output: FloatArray, used: BoolArray) ->
     index = np.arange(samples)
     target = np.interp(index, index[used], output[used])[taps - 1 :]
     target = target - np.mean(target)
-    gram, moment = _normal_equations(inputs, target, taps)
+    gram, moment = gram_of(inputs, target, taps)
     power, least, best = float(target @ target), np.inf, np.zeros(len(moment))
     for decay in _DECAYS:
         root = linalg.block_diag(*[_root_of_kernel(taps, decay)] * count)
@@ -53,9 +53,7 @@ def _root_of_kernel(taps: int, decay: float) -> FloatArray:
     return np.asarray(np.triu(np.ones((taps, taps))) * np.sqrt(kernel[:-1] - kernel[1:]))
 
 
-def _normal_equations(
-    inputs: FloatArray, target: FloatArray, taps: int
-) -> tuple[FloatArray, FloatArray]:
+def gram_of(inputs: FloatArray, target: FloatArray, taps: int) -> tuple[FloatArray, FloatArray]:
     """Return the Gram matrix (mL, mL) of the delayed inputs, without means, and their moments."""
     samples, count = len(target), inputs.shape[1]
     gram = np.empty((count, taps, count, taps))

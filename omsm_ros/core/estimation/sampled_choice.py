@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import signal
 
-from omsm_ros.core.estimation.impulse_response import coherent_power, impulse_response
+from omsm_ros.core.estimation.impulse_response import coherent_power, gram_of, impulse_response
 from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, ParallelSections
 from omsm_ros.core.estimation.sampled_fit import (
     RATE,
@@ -200,9 +200,9 @@ def excited_parameters(input: FloatArray, most: int) -> int:
     """
     if np.ptp(input) == 0:
         raise IdentificationError("estimation.constant_input")
-    windows = np.lib.stride_tricks.sliding_window_view(input, most)
-    varied = windows - np.mean(windows, axis=0)
-    power = np.linalg.eigvalsh(varied.T @ varied)
+    varied = (input - np.mean(input))[:, np.newaxis]
+    gram, _ = gram_of(varied, np.zeros(len(input) - most + 1), most)
+    power = np.linalg.eigvalsh(gram)
     return int(np.sum(power > _UNEXCITED * power[-1]))
 
 
@@ -232,8 +232,7 @@ def _with_delays(problem: SectionsProblem, most: int) -> tuple[SectionsProblem, 
     delays = problem.delays.astype(np.float64)
     best = _late(problem, delays, _DELAY_ORDER)
     for input in range(problem.inputs):
-        tried = range(1, most + 1) if problem.hold != BAND_LIMITED else _FREE_DELAYS[1:]
-        for delay in tried:
+        for delay in range(1, most + 1) if problem.hold != BAND_LIMITED else _FREE_DELAYS[1:]:
             late = np.where(np.arange(len(delays)) == input, delay, delays)
             found = _late(problem, late, _DELAY_ORDER)
             if _better(found, best):
@@ -399,7 +398,6 @@ def _finished(whole: SectionsProblem, candidate: SampledCandidate, every: int) -
         turned = roots * RATE / every
         held = whole.hold != BAND_LIMITED
         roots = np.asarray((2 * np.tanh(turned / 2) if held else turned) / RATE)
-    roots = np.where(abs(roots.imag) < 1e-12 * abs(roots), roots.real + 0j, roots)
     found = whole.fit(fitted.order, [whole.nonlinear_of(roots, late)], _FINAL)
     if every == 1:
         return replace(candidate, fit=found)

@@ -47,8 +47,6 @@ _RELOCATIONS, _RACE = 10, 3
 _START_DAMPING, _ADDED_DAMPINGS, _TRIED_LINES = 0.05, (0.002, 0.01, 0.05), 40
 # Least damping ratio that a start may have, and range of |pole| T / RATE in a start.
 _LEAST_DAMPING, _SLOWEST, _FASTEST = 1e-5, 1e-6, 1e4
-# Time constant [samples] of an added pole that is too fast to matter.
-_FAST = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,13 +118,17 @@ class _Spectra:
 
     def free(self, sections: FloatArray) -> FloatArray:
         """Return an orthonormal basis (places, states + 1) of initial states and offset."""
-        samples = len(self.record)
-        rows = [np.ones(samples)]
-        for d1, d2 in sections:
-            rows += decays_of(recursion(d1 / RATE, d2 / RATE**2, self.hold, 1.0), samples)
-        columns = np.array(rows)[:, self.places].T
-        scale = np.linalg.norm(columns, axis=0)
-        return np.asarray(linalg.qr(columns / np.where(scale > 0, scale, 1.0), mode="economic")[0])
+        # Where even the slowest state has decayed to rounding, e^-36, all places are one row.
+        downs = [recursion(d1 / RATE, d2 / RATE**2, self.hold, 1.0) for d1, d2 in sections]
+        slowest = max((np.max(np.abs(np.roots(down))) for down in downs), default=0.0)
+        lasting = min(int(-36 / np.log(np.clip(slowest, 1e-9, 1 - 1e-9))) + 2, len(self.record))
+        early = self.places[self.places < lasting]
+        late = len(self.places) - len(early)
+        rows = [np.ones(lasting), *(row for down in downs for row in decays_of(down, lasting))]
+        columns = np.pad(np.array(rows)[:, early].T, ((0, 1), (0, 0)))
+        columns[-1, 0] = np.sqrt(late)
+        basis = linalg.qr(columns, mode="economic")[0]
+        return np.concatenate([basis[:-1], np.tile(basis[-1:] / np.sqrt(max(late, 1)), (late, 1))])
 
     @cached_property
     def excited(self) -> tuple[FloatArray, ComplexArray, ComplexArray]:
@@ -398,7 +400,7 @@ def basis_of(sections: FloatArray, w: ComplexArray) -> ComplexArray:
 def grown_starts(problem: SectionsProblem, smaller: SectionsFit, order: int) -> list[ComplexArray]:
     """Return starts, poles (order,) in w: of ``smaller``, and fast, slow or missing ones."""
     more, own = order - smaller.order, smaller.roots()
-    fast = -1 / (_FAST * RATE) * 1.5 ** np.arange(more)
+    fast = -5 / RATE * 1.5 ** np.arange(more)  # too fast to matter
     slowest = -1 / (0.5 * max(len(r) for r in problem.records) * RATE)
     found = [np.concatenate([own, fast]), np.concatenate([own, slowest * 1.5 ** np.arange(more)])]
     upper = _missing_pairs(problem, smaller, more // 2)

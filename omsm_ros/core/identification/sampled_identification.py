@@ -225,8 +225,8 @@ def _neighbours(lines: IntArray, size: int) -> list[IntArray]:
     """Return ``lines`` in blocks of ``size``; none spans more than a ratio of frequencies."""
     blocks, place = [], 0
     while place < len(lines):
-        far = int(np.searchsorted(lines, _BLOCK_RATIO * lines[place] + size / 2))
-        end = max(min(place + size, far), place + 1)
+        near = lines[place : place + size] < _BLOCK_RATIO * lines[place] + size / 2
+        end = place + max(int(np.sum(near)), 1)
         if 2 * (end - place) >= size:
             blocks.append(lines[place:end])
         place = end
