@@ -277,6 +277,8 @@ class SequenceTracker:
         step, advance = self._step(raw), int(sample["time"]) - self._time
         spoilt_time = advance < 0 and not (self._counting.checked or pause.broken or raw == 0)
         advance = 0 if step == 1 and spoilt_time else advance
+        if self._counting.timed:  # the device's own clock, not arrivals, which the host may delay
+            pause = _StreamBreak(max(advance, 0) * NANOSECOND_S, pause.broken)
         in_order = step == 1 and advance >= 0
         # After a restart, samples without time may equal earlier ones by chance.
         may_repeat = self._counting.timed or not pause.broken
@@ -318,10 +320,8 @@ class SequenceTracker:
 
     def _turns(self, step: int, pause: _StreamBreak) -> int:
         """Return the whole turns of the counter in a silence."""
-        if not self._counting.period:
-            return 0
-        missing_samples = pause.elapsed / self._counting.period - step
-        return max(0, round(missing_samples / self._counting.modulus))
+        elapsed = pause.elapsed / self._counting.period if self._counting.period else 0.0
+        return max(0, round((elapsed - step) / self._counting.modulus))
 
 
 @dataclass(frozen=True, slots=True)

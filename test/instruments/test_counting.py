@@ -98,6 +98,18 @@ def test_whole_turns_in_a_silence_are_found_from_its_length(silence: float, lost
     assert (tracker.lost, tracker.restarts) == (lost, 0)
 
 
+@pytest.mark.parametrize(("pause", "lost"), [(0, 0), (65_536, 65_536)])
+def test_the_clock_of_the_device_tells_how_long_a_silence_was(pause: int, lost: int) -> None:
+    """At 70 kHz the counter turns in 0.94 s, and the host may have slept through the samples."""
+    portions = [samples(list(range(100))), samples(list(range(100, 200)))]
+    for shift, portion in zip((0, pause), portions, strict=True):
+        portion["time"] = (portion["distance"] + shift) / 70_000 * 1e9
+    tracker = SequenceTracker(Counting(2**16, timed=True, checked=False, period=1 / 70_000))
+    found = numbers(tracker, portions[0]) + numbers(tracker, portions[1], elapsed=5.0, broken=True)
+    assert found == [*range(100), *range(100 + lost, 200 + lost)]
+    assert (tracker.lost, tracker.restarts) == (lost, 0)
+
+
 def test_more_samples_than_time_passed_for_are_a_restart() -> None:
     tracker = SequenceTracker(FREE)
     numbers(tracker, samples([100]))
