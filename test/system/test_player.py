@@ -13,6 +13,8 @@ from omsm_msgs.msg import AxisBlock, Calibration, DistanceBlock
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
+from omsm_ros.core.correction.correct import CorrectionOptions
+from omsm_ros.core.correction.machine_sources import NOTHING_STATED
 from omsm_ros.core.streams import blocks
 from omsm_ros.io import bags, message_mapping
 from omsm_ros.io.bag_writer import BagWriter
@@ -22,6 +24,7 @@ from omsm_ros.io.results import CloudFile
 from omsm_ros.nodes.topics import LATCHED_QOS, SAMPLES_QOS
 from omsm_ros.pipelines.correct import correct_bag
 from omsm_ros.pipelines.demonstrate import same_points
+from omsm_ros.pipelines.measure import with_sources
 
 BLOCKS = 30  # three seconds
 
@@ -111,7 +114,8 @@ def test_at_any_rate_and_offline_the_clouds_are_equal(cell, small_scan_blocks, t
     path = record(cell.folder / "scan.mcap", pairs)
     calibration_file = cell.folder / "cal.json"
     save_calibration(calibration_file, true_calibration)
-    correct_bag(path, true_calibration, cell.folder / "cloud.ply")
+    options = with_sources(CorrectionOptions(), true_calibration, NOTHING_STATED, None)
+    correct_bag(path, true_calibration, cell.folder / "cloud.ply", options=options)
     offline = CloudFile(cell.folder / "cloud.ply").read()
     assert len(offline) > 80 * BLOCKS
     for rate in (1.0, 50.0, 0.0):
