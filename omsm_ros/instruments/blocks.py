@@ -154,8 +154,9 @@ class BlockCutter:
 
     @property
     def arrives_otherwise(self) -> bool:
-        """Return whether samples without time arrive at another rate than stated."""
-        return not self._channels.timed and abs(self.period_deviation) > ARRIVAL_TOLERANCE
+        """Return whether samples come at another rate than stated, by their time or arrivals."""
+        tolerance = PERIOD_TOLERANCE if self._channels.timed else ARRIVAL_TOLERANCE
+        return abs(self.period_deviation) > tolerance
 
     def add(
         self,

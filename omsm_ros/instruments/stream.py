@@ -198,8 +198,8 @@ class StreamDevice:
         """Return why the samples may be wrong, although they are handed over; empty if not."""
         if self._cutter.arrives_otherwise:
             return (
-                f"samples arrive at {self._rates()}: set sample_period to the trigger's, unless "
-                "a recording is played in time lapse"
+                f"samples come at {self._rates()}: set sample_period to the trigger's, unless a "
+                "recording is played in time lapse"
             )
         if self.decoded and not self._cutter.rate_known:
             return (

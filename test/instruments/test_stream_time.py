@@ -78,6 +78,8 @@ def test_a_wrong_nominal_period_is_noticed(deviation: float, warnings: int) -> N
     _, device = run(encode_frames(frames))
     assert device.statistics.period_warnings == warnings
     assert device.statistics.period_deviation == pytest.approx(deviation, abs=1e-8)
+    said = device.trouble or device.caution
+    assert ("sample_period" in said) == (warnings > 0)
 
 
 # Connection.
