@@ -361,8 +361,10 @@ class _Reference:
             return
         self._judged = float(begin[-1])
         _, drift, rest, _ = _line_below(begin - begin[-1], late)
-        if not self.proven and abs(drift) > _GROSS and waited > _GROSS_SPAN_S:
-            self._limit, self.seen_from = math.inf, 0  # played in time lapse
+        if not self.proven and abs(drift) > _GROSS:  # a backlog, or played in time lapse
+            if waited < 0.7 * _UNKNOWN_S:  # soon enough, that no end of a recording stays in doubt
+                return
+            self._limit, self.seen_from = math.inf, 0
         elif not self.proven and waited > _SCATTERED_S:
             self._set_limit(rest)
         missed = self._settle(known) if self.seen_from else 0

@@ -209,6 +209,14 @@ def test_a_busy_host_alone_costs_no_sample() -> None:
     assert outcome.right + outcome.again > 0.98 * outcome.last
 
 
+@pytest.mark.parametrize("seconds", [0.5, 0.95, 1.05, 1.2, 3.0])
+def test_a_recording_in_time_lapse_ends_without_doubt(seconds: float) -> None:
+    detector, confirmed = MissedTriggerDetector(PERIOD), False
+    for taken in np.arange(0.0, 10 * seconds, 0.1):
+        confirmed = detector.confirms(taken, UPTIME_S + taken / 10)
+    assert confirmed or detector.trusts_last()
+
+
 def test_late_arrivals_alone_are_no_missed_triggers() -> None:
     """A host that is busy for a while delays arrivals by chance, but never all of them."""
     random, detector = np.random.default_rng(1), MissedTriggerDetector(PERIOD)

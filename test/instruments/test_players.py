@@ -24,7 +24,7 @@ SOON = 20.0
 HALF_STEP = {"confocaldt": 100e-6 / 65_536 / 2}
 
 
-def play(name: str, link: str, recording: Recording, lapse: float = 20.0) -> list[BlockPair]:
+def play(name: str, link: str, recording: Recording, lapse: float = 10.0) -> list[BlockPair]:
     """Return the blocks of a driver that reads a motion."""
     got: list[BlockPair] = []
     stop = threading.Event()
