@@ -182,12 +182,11 @@ def _expected_drift(x: FloatArray, y: FloatArray) -> tuple[float, float]:
 _FIRST_S, _FIRST_SPANS = 0.05, 40
 # The largest number of spans up to the last confirmation, and after it.
 _SPANS, _LATEST = 50, 60
-# The least number of spans to be judged, and without a confirming arrival among them.
-_LEAST_SPANS, _SHOWING = 8, 3
+# The least number of spans to be judged, and without a confirming arrival among them; the number
+# of the latest ones, in which no step can be excluded.
+_LEAST_SPANS, _SHOWING, _OPEN = 8, 3, 5
 # Missed triggers are excluded, not likelier than none, and of a certain number by this (log).
 _EXCLUDED, _POSSIBLE, _CERTAIN = 6.0, 1.0, 12.0
-# The latest spans, in which no step can be excluded.
-_OPEN = 5
 # Without a reference for longer, it is the scatter of the arrivals that hides missed triggers [s].
 _SCATTERED_S = 8.0
 # Without a reference, so short a time before a pause is taken to be without missed triggers [s].
