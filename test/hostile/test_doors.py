@@ -178,8 +178,10 @@ def test_many_as_processes_of_their_own(place, small_scan_blocks):
 @pytest.mark.parametrize("every", [3, *soaked(1)])
 def test_what_is_right_comes_through(place, every):
     """Else a door would refuse all that is tried, and this would be no test of it."""
-    wrong = []
-    for case in [*right_cases(place)][::every]:
+    wrong, cases = [], [*right_cases(place)][::every]
+    usual = {path.name for path in place.iterdir()}
+    for case in cases:
         done = ask(case, place)
         wrong += [(case.arguments, done.err)] if done.status else []
+        _tidy(place, usual)
     assert not wrong, "\n".join(map(str, wrong))
