@@ -237,7 +237,7 @@ def _solved(
     inverse = (inverse + inverse.T) / 2
     found = inverse @ right
     # Pose parameters may be so alike that the inverse has few digits; the residual restores them.
-    for _ in range(2):
+    for _ in range(6):
         found += inverse @ (right - full @ found)
     return inverse, found
 
