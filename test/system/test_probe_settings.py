@@ -61,7 +61,7 @@ class Bench:
     def identified(self):
         """Return the calibrator's answer after a step test."""
         self.move("step_test")
-        held = ("axes_held", "distance_held")
+        held = {"axes_held": 0, "distance_held": 0}
         _follow(self.node, "calibrator", held, self.plan.step_test_samples, int)
         return self.node.call(Identify, "/omsm/calibrator/identify", Identify.Request()).calibration
 

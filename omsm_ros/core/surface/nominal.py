@@ -82,9 +82,9 @@ class XYPolynomial(CheckedRecord):
         return self._polynomial().gradient(x, y)
 
     def _polynomial(self) -> PolynomialSurface:
-        table = np.zeros([max((getattr(t, n) for t in self.terms), default=0) + 1 for n in "xy"])
-        for term in self.terms:
-            table[term.x, term.y] += term.value
+        powers = np.array([(0, 0), *((term.x, term.y) for term in self.terms)], int)
+        table = np.zeros(np.max(powers, axis=0) + 1)
+        np.add.at(table, tuple(powers.T), [0.0, *(term.value for term in self.terms)])
         return PolynomialSurface(table, self.radius)
 
 

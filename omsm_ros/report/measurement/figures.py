@@ -449,7 +449,7 @@ def _draw_curve(
         low, value = np.maximum(low, floor / unit), np.where(value < floor, np.nan, value)
     # A line over places without points would show what nobody measured.
     gaps = np.diff(position)
-    empty = np.flatnonzero(gaps > _GAP * np.median(gaps)) + 1
+    empty = np.flatnonzero(gaps > _GAP * np.median(gaps if len(gaps) else 0.0)) + 1
     place: FloatArray = np.insert(position / along, empty, np.nan)
     low, value, high = (np.insert(v, empty, np.nan) for v in (low, value, high))
     axes.fill_between(place, low, high, color=style.AFTER, alpha=0.25, linewidth=0)

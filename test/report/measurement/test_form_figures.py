@@ -83,6 +83,8 @@ def test_densities_are_read_in_nanometres_and_waves_per_millimetre():
     without = {**CURVES["psd"]["radial"], "value": [4e-24, 0.0, 1e-25]}
     axes = form_figures.radial_density(without).axes[0]
     assert axes.lines[0].get_ydata() == pytest.approx([4.0, np.nan, 0.1], nan_ok=True)
+    single = {name: values[:1] for name, values in without.items()}
+    assert len(form_figures.radial_density(single).axes[0].lines[0].get_ydata()) == 1
     turn = form_figures.direction_density(CURVES["psd"]["azimuthal"]).axes[0]
     assert turn.lines[0].get_ydata() == pytest.approx([1.0, 4.0, 2.0])
     assert turn.lines[0].get_xdata()[0] == pytest.approx(np.degrees(0.1))
