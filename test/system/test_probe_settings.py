@@ -93,7 +93,7 @@ def test_a_scan_with_another_averaging_is_refused_live_and_offline(cell):
 
     belonging = bench.recorded("belonging.mcap", 4)
     cell.wait("its return", lambda: said not in node.text("corrector", "message"))
-    _scan(node, bench.plan, int)
+    _scan(node, bench.plan, "scan", bench.plan.scan_samples, int)
     assert node.value("corrector", "clouds_published") > 0
     cell.processes.end("recorder")
     with Recording(belonging) as recording:
