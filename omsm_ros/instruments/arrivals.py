@@ -361,7 +361,7 @@ class _Reference:
         self._judged = float(begin[-1])
         _, drift, rest, _ = _line_below(begin - begin[-1], late)
         if not self.proven and abs(drift) > _GROSS:  # a backlog, or played in time lapse
-            if waited < 0.7 * _UNKNOWN_S:  # soon enough, that no end of a recording stays in doubt
+            if waited < 0.7 * _UNKNOWN_S:  # else the end of a recording stays in doubt
                 return
             self._limit, self.seen_from = math.inf, 0
         elif not self.proven and waited > _SCATTERED_S:

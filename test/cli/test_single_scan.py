@@ -109,7 +109,7 @@ def test_a_part_in_any_pose_has_the_figure_of_the_part(capsys, shop):
     one, other = (found[n]["peak_to_valley"] for n in ("scan", "posed"))
     spread = np.hypot(one["standard_uncertainty"], other["standard_uncertainty"])
     assert abs(one["value"] - other["value"]) < 3 * spread
-    # What the pose hides is small beside what a single scan leaves open.
+    # The pose adds little to the uncertainty that one scan leaves.
     assert other["standard_uncertainty"] < 1.5 * one["standard_uncertainty"] < 1e-7
 
 

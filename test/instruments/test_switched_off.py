@@ -12,7 +12,7 @@ from .test_devices_by_the_facts import Device, blocks_for, connected
 
 
 class Positioned(Device):
-    """Its encoders have counted so many since it was switched on."""
+    """A device whose encoders count from where it was switched on."""
 
     position = 0
 

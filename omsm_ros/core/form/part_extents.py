@@ -107,7 +107,7 @@ class _PartForm(NamedTuple):
     noise: of the deviation [m]
     local: points that differ from the smooth form (m,);  blurred: rms of the form lost [m]
     texture: height of waves that the scatter about the value shows, but no mean (n,) [m]
-    hidden: how far other grids of cells show the form below and above the value (2, n) [m]
+    unseen: how far other grids of cells show the form below and above the value (2, n) [m]
     """
 
     value: FloatArray
@@ -121,7 +121,7 @@ class _PartForm(NamedTuple):
     local: IntArray
     blurred: float
     texture: FloatArray
-    hidden: FloatArray
+    unseen: FloatArray
 
     @classmethod
     def of(cls, map_: DeviationMap, disc: Aperture) -> _PartForm:
@@ -137,12 +137,12 @@ class _PartForm(NamedTuple):
         value[local], error[local], cell[local] = form, noise, len(map_) + own
         above = value - mean
         mean[local], blurred = form, (1 - share) * float(np.sqrt(more))
-        left, hidden = map_.deviation - value, np.zeros((2, len(map_)))
+        left, unseen = map_.deviation - value, np.zeros((2, len(map_)))
         for at, other, *_ in others:
-            hidden[:, at] = np.maximum(hidden[:, at], np.outer((-1, 1), other - value[at]))
+            unseen[:, at] = np.maximum(unseen[:, at], np.outer((-1, 1), other - value[at]))
         texture = _texture(map_, left)
         return cls(
-            value, fit, cell, error, mean, left, above, map_.noise, local, blurred, texture, hidden
+            value, fit, cell, error, mean, left, above, map_.noise, local, blurred, texture, unseen
         )
 
     def extents(
@@ -257,10 +257,10 @@ class _Gaps(NamedTuple):
         rim, further = np.sum(self.weights * form[self.near], axis=2)
         weights, found = np.sum(self.weights, axis=0), []
         chance = 2 * np.sqrt(np.sum((weights * part.error[self.near]) ** 2, axis=1))
-        for sign, hidden in zip((-1, 1), part.hidden, strict=True):
+        for sign, unseen in zip((-1, 1), part.unseen, strict=True):
             values = sign * form
             at_rim = float(np.max(sign * (rim + further) - chance, initial=-np.inf))
-            summit = self._summit(values + hidden, sign * part.above + hidden, part.error)
+            summit = self._summit(values + unseen, sign * part.above + unseen, part.error)
             found.append(max(summit, at_rim) - float(values.max()))
         # The points stand for the way to the rim; along it the form changes by half on average.
         more = float(self.share @ (rim**2 - form[self.near[:, 0]] ** 2)) / 4

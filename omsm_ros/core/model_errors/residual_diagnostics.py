@@ -163,7 +163,7 @@ class ResidualSpace:
         chi_square = float(found @ np.linalg.pinv(spread, rcond=1e-9, hermitian=True) @ found)
         size[free] = found / unit
         covariance[np.ix_(free, free)] = spread / np.outer(unit, unit)
-        # What the readings of a plateau share would count as a walk that the rows end.
+        # Rounding that is common to a plateau would count as a walk, which the rows explain.
         explained *= self.problem.shared == 0
         return Score(size, covariance, max(chi_square, explained), degrees)
 

@@ -43,7 +43,7 @@ def validated(sections, blocks, apart=()):
 def test_most_narrow_blocks_must_agree_where_the_model_is_uncertain(different, ratio, size, valid):
     """Twenty blocks within a sixth of an octave; a wide one may hide a mode.
 
-    What is known of a response ten times as large is not known in a zero beside it.
+    The same error is ten times as large, relative to the response, in a zero beside a peak.
     """
     sections = known(0.2)
     size = size * np.abs(sections.response(np.array([0.5]))[0, 0])
