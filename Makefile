@@ -29,8 +29,9 @@ demo: setup
 
 # Three processes, a file each, in the order of test/conftest.py; JOBS=0 for one after the other.
 JOBS ?= 3
+PYTEST = $(RUN) python -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 test: compiled lint
-	$(RUN) python -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
+	$(PYTEST)
 
 # While types are checked, one process compiles the tests; else each of those that run them would.
 compiled: setup
@@ -51,7 +52,7 @@ bench: $(PEERS)
 	$(RUN) python -m benchmarks $(if $(FULL),--full)
 
 soak: setup
-	$(RUN) python -m pytest -m soak --timeout=0
+	$(PYTEST) -m soak --timeout=0
 	$(RUN) OMSM_MISSED_TRIGGERS=200 python -m pytest test/instruments/test_missed_triggers.py
 
 # The manual, in out/docs.
