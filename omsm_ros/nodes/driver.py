@@ -118,6 +118,7 @@ class DriverNode(ManagedNode):
         self._publisher_of = {
             kind: self.publish_on(undo, _OUTPUTS[kind].message, topic)
             for kind, topic in self._topics.items()
+            if kind is not AxisBlock or self._device.channels.axes is not None
         }
 
     def activate(self, undo: ExitStack) -> None:

@@ -10,6 +10,7 @@ pytest.importorskip("omsm_msgs", reason="the messages are not built")
 
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
 from omsm_ros.core.streams.monitoring import RecentIncrease, SampleFlow
+from omsm_ros.instruments.blocks import Channels
 from omsm_ros.instruments.reader import State
 from omsm_ros.io import message_mapping
 from omsm_ros.nodes import driver as driving
@@ -148,6 +149,18 @@ def test_a_driver_of_axes_alone_passes_over_distances(driver):
     driver._publish([pair()])
     assert len(driver._publisher_of[AxisBlock]) == 1
     assert "confocal_subscribers" not in driver.passes(1.0, 1000).values
+
+
+@pytest.mark.parametrize("axes", [None, ()])
+def test_a_driver_publishes_axes_only_if_its_device_has_some(driver, axes):
+    # Else beside the driver of the axes two nodes would publish them, and both would warn for ever.
+    device = SimpleNamespace(channels=Channels(axes=axes))
+    driver._make, driver._settings_topic = lambda values, now: device, ""
+    driver.get_logger = lambda: SimpleNamespace(info=None, warning=None)
+    driver.publish_on = lambda undo, kind, topic: topic
+    DriverNode.configure(driver, None)
+    published = [*driver._publisher_of.values()]
+    assert published == (["confocal"] if axes is None else ["axes", "confocal"])
 
 
 def test_settings_are_reported_once_before_the_first_block_and_again_when_they_change(driver):

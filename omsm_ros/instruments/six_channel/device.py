@@ -2,11 +2,13 @@
 
 import ctypes
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 from urllib.parse import parse_qs
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.instruments.blocks import BlockSettings, Channels
@@ -29,8 +31,6 @@ from omsm_ros.instruments.six_channel.protocol import (
 from omsm_ros.instruments.stream import StreamDevice
 from omsm_ros.instruments.transport import Transport, parts_of
 
-_SEQUENCE_RANGE = 2**32
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamSettings(BlockSettings):
@@ -50,11 +50,7 @@ class GenericStreamDevice(StreamDevice):
     ) -> None:
         settings = settings or StreamSettings()
         super().__init__(
-            transport,
-            settings,
-            Channels(axes=settings.scaling.axes),
-            Counting(_SEQUENCE_RANGE),
-            *clocks,
+            transport, settings, Channels(axes=settings.scaling.axes), Counting(2**32), *clocks
         )
         self.unknown_status = 0
         self._scaling = settings.scaling
@@ -193,13 +189,14 @@ def make_text(values: Values, transport: Transport, now_ns: NowNs, **more: Any) 
 #
 # Tested against the test server of pyads, not on hardware.
 
-_DEFAULT_PORT = 851
 _DEFAULT_SYMBOL = "GVL.omsm"
 _DEFAULT_SAMPLES = 1000
 
-_WRITTEN = np.dtype("<u8")
+_WRITTEN_SIZE = 8
 # At 1 kHz this gives twenty samples at a time, and a ring of a thousand holds a second [s].
 _POLL_S = 0.02
+# An answer that takes longer than this counts as lost, so that the driver connects again [ms].
+_ANSWER_MS = 1000
 _MOST_SAMPLES = 200_000
 
 
@@ -208,7 +205,8 @@ class AdsRing:
 
     The ring is delivered as the six-channel stream. Without a net id it is the host's address with
     ``.1.1``, as TwinCAT sets it. The PLC must have a route to this computer. Samples that were
-    overwritten before they were read are a gap of the trigger counter.
+    overwritten before they were read are a gap of the trigger counter; those that the ring still
+    holds after a lost connection are not lost.
     """
 
     def __init__(self, address: str) -> None:
@@ -227,23 +225,25 @@ class AdsRing:
         self._host = parts.hostname
         self._net_id = parts.path.strip("/") or f"{self._host}.1.1"
         try:
-            self._port = parts.port or _DEFAULT_PORT
+            self._port = parts.port or 851
         except ValueError as err:
             raise ConfigurationError(f"address {address!r}: {err}") from err
         self._symbol = query.get("symbol", [_DEFAULT_SYMBOL])[0]
         self._capacity = int(samples)
-        self._size = _WRITTEN.itemsize + self._capacity * BODY_SIZE
+        self._size = _WRITTEN_SIZE + self._capacity * BODY_SIZE
         self._plc: Any = None
-        self._taken = 0
+        self._taken = -1
 
     def open(self) -> None:
-        """Connect and begin with the next sample; raises DeviceError."""
+        """Connect, the first time to begin with the next sample; raises DeviceError."""
         self.close()
         pyads = _pyads()
         try:
             self._plc = pyads.Connection(self._net_id, self._port, self._host)
             self._plc.open()
-            self._taken = self._written(self._snapshot())
+            self._plc.set_timeout(_ANSWER_MS)
+            written, _ = self._snapshot()
+            self._taken = written if self._taken < 0 else self._taken
         except (pyads.ADSError, OSError, ValueError, TypeError) as err:
             self.close()
             if isinstance(err, DeviceError):
@@ -273,41 +273,36 @@ class AdsRing:
         """Disconnect; does nothing when not connected."""
         if self._plc is not None:
             plc, self._plc = self._plc, None
-            try:
+            with suppress(Exception):  # it is closed in any state
                 plc.close()
-            except Exception:  # it is closed in any state
-                return
 
     def _new(self) -> bytes:
-        raw = self._snapshot()
-        written = self._written(raw)
+        written, ring = self._snapshot()
         if written < self._taken:  # the PLC was restarted
             self._taken = 0
         count = min(written - self._taken, self._capacity)
         if not count:
             return b""
-        ring = np.frombuffer(raw, np.uint8, offset=_WRITTEN.itemsize).reshape(-1, BODY_SIZE)
-        places = np.arange(written - count, written) % self._capacity
+        places = ((written - count) % self._capacity + np.arange(count)) % self._capacity
         self._taken = written
         frames = np.zeros((count, FRAME.itemsize), np.uint8)
         frames[:, :BODY_SIZE] = ring[places]
         return encode_frames(frames.reshape(-1).view(FRAME))
 
-    def _snapshot(self) -> bytes:
+    def _snapshot(self) -> tuple[int, NDArray[np.uint8]]:
+        """Return how many samples were written so far, and the ring (capacity, bytes)."""
         pyads = _pyads()
         try:
-            found = self._plc.read_by_name(self._symbol, ctypes.c_ubyte * self._size)
+            kind = ctypes.c_ubyte * self._size
+            raw = bytes(self._plc.read_by_name(self._symbol, kind, return_ctypes=True))
         except (pyads.ADSError, OSError, RuntimeError) as err:
             raise DeviceError(
                 f"{self.name} returns no {self._symbol!r} of {self._size} bytes: {err}; check the "
                 f"PLC, the network, and that its ring has {self._capacity} samples, packed to one "
                 "byte"
             ) from err
-        return bytes(found)
-
-    @staticmethod
-    def _written(raw: bytes) -> int:
-        return int(np.frombuffer(raw, _WRITTEN, 1)[0])
+        ring = np.frombuffer(raw, np.uint8, offset=_WRITTEN_SIZE).reshape(-1, BODY_SIZE)
+        return int.from_bytes(raw[:_WRITTEN_SIZE], "little"), ring
 
 
 def _pyads() -> Any:
