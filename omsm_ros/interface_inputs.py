@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, on_counts
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.interface_calibration import Calibration
 from omsm_ros.interface_results import Points, Recording, load_saved
@@ -57,12 +57,11 @@ def read(path: Path | str, columns: Path | str | None = None) -> Recording:
         raise DataError(f"{str(path)!r} has no samples of axes and probe; record both")
     first = min(b.first_sample for b in (*axes, *distance))
     last = max(b.first_sample + len(b) for b in (*axes, *distance))
-    made = {name: np.full(last - first, np.nan) for name in ("z", "x", "c", "distance")}
-    for block in (*axes, *distance):
-        names = ("z", "x", "c") if isinstance(block, AxisBlock) else ("distance",)
-        begin = block.first_sample - first
-        for name in names:
-            made[name][begin : begin + len(block)] = getattr(block, name)
+    made = {
+        name: on_counts(((b.first_sample, getattr(b, name)) for b in blocks), first, last)
+        for blocks, names in ((axes, ("z", "x", "c")), (distance, ("distance",)))
+        for name in names
+    }
     return Recording(**made, period=float(axes[0].sample_period), name=str(path))
 
 

@@ -7,14 +7,14 @@ import numpy as np
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.verification import PathCheck, check_path
-from omsm_ros.core.correction.counter_offset import CounterOffset, counter_offset
+from omsm_ros.core.correction.counter_offset import CounterOffset, offset_of_motion
 from omsm_ros.core.correction.predict import Prediction, predict_error
 from omsm_ros.core.estimation.preparation import check_gain
 from omsm_ros.core.estimation.steps import check_usable
 from omsm_ros.core.kinematics.scan_path import ScanPath
 from omsm_ros.core.lti.discretisation import discretise
 from omsm_ros.core.lti.recursion import through
-from omsm_ros.core.streams.blocks import AxisBlock, Block, DistanceBlock, FloatArray
+from omsm_ros.core.streams.blocks import AxisBlock, Block, DistanceBlock, FloatArray, on_counts
 from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.errors import CalibrationError, DataError
 from omsm_ros.io.topics import AnyBag
@@ -60,8 +60,6 @@ def _check_follows(predicted: FloatArray, seen: FloatArray) -> None:
         )
 
 
-# Largest error of the stamps [s]: a link that delivers late, a clock that is still adjusting.
-_STAMP_ERROR_S = 0.25
 # Bounds memory: an hour at 1 kHz.
 _MOST_SAMPLES = 4_000_000
 
@@ -89,28 +87,26 @@ def offset_in(
     period = float(axes[0].sample_period)
     guess = _by_stamps(axes, distance, period)
     first = axes[0].first_sample
-    z = _column(axes, first, [b.z for b in axes if isinstance(b, AxisBlock)])
-    d = _column(
-        distance,
-        first - guess,
-        [np.where(b.ok, b.distance, np.nan) for b in distance if isinstance(b, DistanceBlock)],
+    ends = [max(b.end for b in axes), max(b.end for b in distance) + guess]
+    for end in ends:
+        if not 0 < end - first <= _MOST_SAMPLES:
+            raise DataError(
+                f"counters of axes and distance span {end - first} samples, expected 1 to "
+                f"{_MOST_SAMPLES}: the bag holds two recordings, or streams of different times; "
+                "use one motion"
+            )
+    z = ((b.first_sample, b.z) for b in axes if isinstance(b, AxisBlock))
+    d = (
+        (b.first_sample + guess, np.where(b.ok, b.distance, np.nan))
+        for b in distance
+        if isinstance(b, DistanceBlock)
     )
-    both = min(len(z), len(d))
-    z, d = z[:both], d[:both]
-    known = np.flatnonzero(np.isfinite(z))
-    if not len(known):
+    z_on_counts, d_on_counts = (on_counts(parts, first, min(ends)) for parts in (z, d))
+    if not np.any(np.isfinite(z_on_counts)):
         raise DataError(
             f"{str(path)!r} has no position of Z at the times of its distance; record a motion"
         )
-    z = np.interp(np.arange(both), known, z[known])
-    found = counter_offset(
-        z,
-        d,
-        np.isfinite(d),
-        most=min(round(_STAMP_ERROR_S / period), both // 8),
-        lag=calibration.dynamics.low_frequency_delay / period,
-        lag_uncertainty=calibration.low_frequency_delay_uncertainty / period,
-    )
+    found = offset_of_motion(z_on_counts, d_on_counts, calibration, period)
     return replace(found, samples=guess + found.samples)
 
 
@@ -125,22 +121,6 @@ def _by_stamps(axes: Sequence[Block], distance: Sequence[Block], period: float) 
         for i, b in zip(near, distance, strict=True)
     ]
     return round(float(np.median(apart)))
-
-
-def _column(blocks: Sequence[Block], first: int, values: Sequence[FloatArray]) -> FloatArray:
-    """Return the values by count from ``first`` on (n,), NaN for missing samples."""
-    length = max(b.end for b in blocks) - first
-    if not 0 < length <= _MOST_SAMPLES:
-        raise DataError(
-            f"counters of axes and distance span {length} samples, expected 1 to {_MOST_SAMPLES}: "
-            "the bag holds two recordings, or streams of different times; use one motion"
-        )
-    found = np.full(length, np.nan)
-    for block, column in zip(blocks, values, strict=True):
-        start = block.first_sample - first
-        if start + len(column) > 0:
-            found[max(0, start) : start + len(column)] = column[max(0, -start) :]
-    return found
 
 
 def predict_from(

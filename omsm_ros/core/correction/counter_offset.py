@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray, on_counts
 from omsm_ros.errors import DataError
 from omsm_ros.linear_algebra import unit_columns
 
@@ -34,7 +34,7 @@ _LEAST_SAMPLES = 200
 _ROOM, _COVERAGE = 0.5, 3.0
 # Span of the newest motion that is judged [s], and its most samples.
 _SPAN_S, _MOST_SAMPLES = 4.0, 16_384
-# Range of the search: the longest delay of a link [s].
+# Range of the search: the longest delay of a link, or error of a clock that still adjusts [s].
 _SEARCH_S = 0.25
 # Relative tolerance of the static gain. A surface that moves with Z some samples later would look
 # like an offset, but with another gain than a fixed target.
@@ -166,6 +166,26 @@ def _correlation_length(residual: FloatArray) -> float:
     return (1 + near) / (1 - near)
 
 
+def offset_of_motion(
+    z: FloatArray, distance: FloatArray, calibration: Calibration, period: float
+) -> CounterOffset:
+    """Return the offset within a quarter of a second, with the lag that ``calibration`` states.
+
+    z, distance: at equal counts every ``period`` [s], NaN where lost [m], (n,)
+
+    Raises DataError as :func:`counter_offset` does.
+    """
+    index, known = np.arange(len(z)), np.flatnonzero(np.isfinite(z))
+    return counter_offset(
+        np.interp(index, known, z[known]),
+        distance,
+        np.isfinite(distance),
+        most=min(round(_SEARCH_S / period), len(z) // 8),
+        lag=calibration.dynamics.low_frequency_delay / period,
+        lag_uncertainty=calibration.low_frequency_delay_uncertainty / period,
+    )
+
+
 class LiveOffset:
     """Determines the offset of two running counters from the newest motion.
 
@@ -177,9 +197,7 @@ class LiveOffset:
     def __init__(self, calibration: Calibration, in_use: int) -> None:
         self.in_use = in_use
         self.established: CounterOffset | None = None
-        self._gain = abs(calibration.static_gain)
-        self._lag = calibration.dynamics.low_frequency_delay
-        self._lag_uncertainty = calibration.low_frequency_delay_uncertainty
+        self._calibration = calibration
         self._axes: deque[tuple[int, FloatArray]] = deque()
         self._distance: deque[tuple[int, FloatArray]] = deque()
         self._found: tuple[int, int] | None = None
@@ -215,23 +233,15 @@ class LiveOffset:
         first = max(*(parts[0][0] for parts in streams), end - self._most)
         if end <= first or (self._found is not None and end < self._found[0] + _APART_S / period):
             return
-        z, distance = (_column(parts, first, end) for parts in streams)
-        known = np.flatnonzero(np.isfinite(z))
-        if not len(known):
+        z, distance = (on_counts(parts, first, end) for parts in streams)
+        if not np.any(np.isfinite(z)):
             return
-        z = np.interp(np.arange(len(z)), known, z[known])
         try:
-            found = counter_offset(
-                z,
-                distance,
-                np.isfinite(distance),
-                most=min(round(_SEARCH_S / period), len(z) // 8),
-                lag=self._lag / period,
-                lag_uncertainty=self._lag_uncertainty / period,
-            )
+            found = offset_of_motion(z, distance, self._calibration, period)
         except DataError:
             return  # this motion does not determine the offset
-        if abs(abs(found.gain) - self._gain) > _SAME_GAIN * self._gain:
+        gain = abs(self._calibration.static_gain)
+        if abs(abs(found.gain) - gain) > _SAME_GAIN * gain:
             return  # the probe follows a surface
         before, self._found = self._found, (end, found.samples)
         if before is not None and before[1] == found.samples:
@@ -241,13 +251,3 @@ class LiveOffset:
 def _end(parts: deque[tuple[int, FloatArray]]) -> int:
     """Return the count after the last of ``parts``, which are (first count, values)."""
     return parts[-1][0] + len(parts[-1][1])
-
-
-def _column(parts: deque[tuple[int, FloatArray]], first: int, end: int) -> FloatArray:
-    """Return the values of counts ``first`` to ``end`` (n,), NaN for missing ones."""
-    made = np.full(end - first, np.nan)
-    for start, values in parts:
-        low, high = max(start, first), min(start + len(values), end)
-        if low < high:
-            made[low - first : high - first] = values[low - start : high - start]
-    return made

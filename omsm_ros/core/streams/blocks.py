@@ -8,7 +8,7 @@ that never came are ``missing`` and not part of this sum.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from enum import IntEnum
 from types import MappingProxyType
@@ -309,6 +309,19 @@ def uninterrupted(blocks: Sequence[AnyBlock]) -> list[list[AnyBlock]]:
         else:
             runs.append([block])
     return runs
+
+
+def on_counts(parts: Iterable[tuple[int, FloatArray]], first: int, end: int) -> FloatArray:
+    """Return the values at the counts ``first`` to ``end`` (n,), NaN where there is none.
+
+    parts: first count and values of each; a later one replaces what came before
+    """
+    made = np.full(end - first, np.nan)
+    for start, values in parts:
+        low, high = max(start, first), min(start + len(values), end)
+        if low < high:
+            made[low - first : high - first] = values[low - start : high - start]
+    return made
 
 
 def consecutive(blocks: Sequence[B]) -> list[list[B]]:
