@@ -234,7 +234,6 @@ def adjust(
     >>> omsm.adjust([scan], calibration, nominal=mirror).verdict  # one scan does not verify itself
     'not_verified'
     """
-    from omsm_ros.core.correction.machine_sources import NOTHING_STATED
     from omsm_ros.io.descriptions import load_sources
     from omsm_ros.pipelines.adjust import adjust_bags, adjustment_facts
 
@@ -244,7 +243,7 @@ def adjust(
             paths,
             calibration.core,
             nominal=nominal,
-            stated=load_sources(sources) if sources else NOTHING_STATED,
+            stated=load_sources(sources),
             clockings=clocking,
             accuracy=accuracy,
         )

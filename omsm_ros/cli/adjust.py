@@ -5,7 +5,6 @@ import argparse
 from omsm_ros.cli.arguments import Arguments, cell_of
 from omsm_ros.cli.command import CliCommand, Facts, table, written
 from omsm_ros.core.correction.correct import CorrectionOptions
-from omsm_ros.core.correction.machine_sources import NOTHING_STATED
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_geometry, load_sources, load_surface
 from omsm_ros.messages.verdict import SOURCE_NAMES
@@ -42,16 +41,13 @@ def _declare(add: Arguments) -> None:
 
 
 def _adjust(args: argparse.Namespace) -> Facts:
-    options = CorrectionOptions(polarity=args.polarity)
-    if args.geometry:
-        options = CorrectionOptions(polarity=args.polarity, geometry=load_geometry(args.geometry))
-    calibration = load_calibration(args.calibration)
+    geometry, calibration = load_geometry(args.geometry), load_calibration(args.calibration)
     found, scans = adjust_bags(
         [cell_of(path, args) for path in args.scans],
         calibration,
         nominal=load_surface(args.nominal) if args.nominal else None,
-        options=options,
-        stated=load_sources(args.sources) if args.sources else NOTHING_STATED,
+        options=CorrectionOptions(polarity=args.polarity, geometry=geometry),
+        stated=load_sources(args.sources),
         clockings=args.clocking,
         clampings=args.clamping,
         accuracy=args.accuracy,

@@ -3,7 +3,6 @@
 import argparse
 from argparse import SUPPRESS
 from dataclasses import asdict
-from pathlib import Path
 
 from omsm_ros.cli.arguments import (
     TABLE_SUFFIX,
@@ -18,8 +17,7 @@ from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows, r
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
 from omsm_ros.core.correction.predict import DEFAULT_BUDGET_M, predict_error
-from omsm_ros.core.kinematics.kinematics import Geometry
-from omsm_ros.core.kinematics.limits import FASTEST, MachineLimits
+from omsm_ros.core.kinematics.limits import FASTEST
 from omsm_ros.core.kinematics.scan_path import ScanPath
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import json_and_yaml
@@ -45,16 +43,9 @@ from omsm_ros.report.verdict import headline, next_steps
 
 def sources_of(text: str | None) -> MachineSources:
     """Return the uncertainty sources of the machine, from a file or from JSON text."""
-    if text is None:
-        return MachineSources()
-    if text.lstrip().startswith("{"):
+    if text is not None and text.lstrip().startswith("{"):
         return declared_sources(json_and_yaml.object_of(text, ConfigurationError, "--sources"))
     return load_sources(text)
-
-
-def geometry_of(path: Path | None) -> Geometry:
-    """Return the geometry of the probe from a file; zeros without one."""
-    return load_geometry(path) if path else Geometry()
 
 
 def _declare_correct(add: Arguments) -> None:
@@ -112,7 +103,7 @@ def _correct(args: argparse.Namespace) -> Facts:
         polarity=args.polarity,
         accept_other_rate=args.override,
         probe_latency=args.probe_latency,
-        geometry=geometry_of(args.geometry),
+        geometry=load_geometry(args.geometry),
         pitch=load_pitch(args.pitch) if args.pitch else None,
         trigger=trigger_of(args),
     )
@@ -178,8 +169,7 @@ def _predict(args: argparse.Namespace) -> Facts:
     else:
         with Recording(cell_of(args.motion, args)) as recording:
             path = recording.scan_path()
-    limits = load_limits(args.limits) if args.limits else MachineLimits()
-    return asdict(predict_error(calibration, path, args.budget, limits))
+    return asdict(predict_error(calibration, path, args.budget, load_limits(args.limits)))
 
 
 def _show_predict(facts: Facts) -> None:
@@ -229,7 +219,7 @@ def _align(args: argparse.Namespace) -> Facts:
     from omsm_ros.pipelines.study_scans import alignment_of
 
     calibration = load_calibration(args.calibration)
-    known = geometry_of(args.geometry)
+    known = load_geometry(args.geometry)
     found, account = alignment_of(cell_of(args.bag, args), calibration, args.radius, known)
     save_geometry(args.out, found.geometry)
     names = ("centre_x", "centre_y", "beam_x", "beam_y")

@@ -403,8 +403,7 @@ def _declare_surface(add: Arguments) -> None:
 
 
 def _surface(args: argparse.Namespace) -> Facts:
-    limits = load_limits(args.limits) if args.limits else MachineLimits()
-    scan = Scan(args.radius, args.feed, args.rpm)
+    limits, scan = load_limits(args.limits), Scan(args.radius, args.feed, args.rpm)
     facts = show_surface(load_surface(args.surface), scan, limits, args.probe_angle, args.out)
     where = {"out": str(args.out)} if args.out is not None else {}
     return {"surface": str(args.surface), **facts, **where}

@@ -9,15 +9,8 @@ import numpy as np
 
 from omsm_ros.cli.arguments import Arguments, values_of
 from omsm_ros.cli.command import CliCommand, Facts, say, table, written
-from omsm_ros.core.correction.machine_sources import NOTHING_STATED
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.kinematics.limits import (
-    KnownOfMachine,
-    MachineLimits,
-    choose_motion,
-    harmonic_orders,
-    margins,
-)
+from omsm_ros.core.kinematics.limits import KnownOfMachine, choose_motion, harmonic_orders, margins
 from omsm_ros.core.kinematics.trajectories import (
     PLANNED_COUNT,
     PLANNED_DWELL_S,
@@ -177,11 +170,7 @@ def _plan_scans(args: argparse.Namespace) -> Facts:
     nominal = _nominal(args)
     first = ScanDesign(rpm=args.rpm, start=_radius(args, nominal), end=0.0, pitch=args.feed)
     sets = planned_sets(
-        first,
-        nominal,
-        load_sources(args.sources) if args.sources else NOTHING_STATED,
-        args.accuracy,
-        _limits(args),
+        first, nominal, load_sources(args.sources), args.accuracy, load_limits(args.limits)
     )
     return plan_facts(
         sets, args.accuracy, args.out, nominal, args.dialect, args.path_error, args.servo_period
@@ -205,7 +194,7 @@ def _plan_motion(args: argparse.Namespace) -> Facts:
     design = ScanDesign(
         rpm=best.rpm, start=_radius(args, nominal), end=0.0, pitch=best.feed, rate=best.rate
     )
-    refuse_beyond(design, nominal, _limits(args), args.accuracy)
+    refuse_beyond(design, nominal, load_limits(args.limits), args.accuracy)
     (path,) = write_scans(
         [design], nominal, args.out, args.path_error, args.servo_period, args.dialect
     )
@@ -247,10 +236,6 @@ def _show_motion(facts: Facts) -> None:
             written(facts["files"]),
         ]
     )
-
-
-def _limits(args: argparse.Namespace) -> MachineLimits:
-    return load_limits(args.limits) if args.limits else MachineLimits()
 
 
 def _nominal(args: argparse.Namespace) -> Surface:

@@ -13,8 +13,7 @@ from omsm_ros.core.adjustment.source_evaluation import (
     sources_of_alignment,
 )
 from omsm_ros.core.correction.correct import CorrectionOptions
-from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources, with_assumed
-from omsm_ros.core.kinematics.kinematics import Geometry
+from omsm_ros.core.correction.machine_sources import MachineSources, with_assumed
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.calibration_file import load_calibration
@@ -49,7 +48,7 @@ def _declare(add: Arguments) -> None:
 
 def _sources(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
-    geometry = load_geometry(args.geometry) if args.geometry else Geometry()
+    geometry = load_geometry(args.geometry)
     bag = cell_of(args.bag, args)
     options = CorrectionOptions(polarity=args.polarity, geometry=geometry)
     scan = read_scan(bag, calibration, options)
@@ -57,7 +56,7 @@ def _sources(args: argparse.Namespace) -> Facts:
         if args.radius is None:
             raise ConfigurationError("a sphere needs its radius; give --radius")
         aligned, _ = alignment_of(bag, calibration, args.radius, geometry)
-        drift = _drift(load_sources(args.out) if args.out.exists() else NOTHING_STATED)
+        drift = _drift(load_sources(args.out if args.out.exists() else None))
         found, missing = sources_of_alignment(aligned, geometry, scan.data, drift)
     else:
         nominal = load_surface(args.nominal) if args.nominal else Flat()

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_or
 import numpy as np
 import yaml
 
-from omsm_ros.core.correction.machine_sources import MachineSources, StatedSource
+from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources, StatedSource
 from omsm_ros.core.correction.source_kinds import FORMER_NAMES, KINDS
 from omsm_ros.core.kinematics.kinematics import Geometry, PitchCurve, Surface
 from omsm_ros.core.kinematics.limits import MachineLimits
@@ -41,13 +41,13 @@ _MOST_ITEMS = 100
 _T = TypeVar("_T")
 
 
-def load_geometry(path: Path | str) -> Geometry:
-    """Read ``GEOMETRY.yaml``: position and direction of the probe, in metres and slopes."""
+def load_geometry(path: Path | str | None) -> Geometry:
+    """Read ``GEOMETRY.yaml``: place and direction of the probe [m], [1]; zeros without a file."""
     return _load(Geometry, path, "geometry")
 
 
-def load_limits(path: Path | str) -> MachineLimits:
-    """Read ``LIMITS.yaml``: limits of servo, probe, spindle and axes, units in the names."""
+def load_limits(path: Path | str | None) -> MachineLimits:
+    """Read ``LIMITS.yaml``: limits of servo, probe and axes; the usual ones without a file."""
     return _load(MachineLimits, path, "limits")
 
 
@@ -58,8 +58,10 @@ def load_disturbances(path: Path | str) -> Disturbances:
     return _load(Disturbances, path, "disturbances")
 
 
-def _load(kind: type[_T], path: Path | str, what: str) -> _T:
+def _load(kind: type[_T], path: Path | str | None, what: str) -> _T:
     """Read a record of numbers, and of records of them; FileError for another name or value."""
+    if path is None:
+        return kind()
     content = load_object(path, what, MAX_YAML_BYTES, _schema_of(kind), yaml=True)
     with named_errors(FileError, f"{what} {str(path)!r}", ConfigurationError):
         return _made(kind, content)  # type: ignore[no-any-return]
@@ -181,8 +183,10 @@ _FORM = form(
 )
 
 
-def load_sources(path: Path | str) -> MachineSources:
-    """Read ``SOURCES.yaml``; FileError, which names the source and the error."""
+def load_sources(path: Path | str | None) -> MachineSources:
+    """Read ``SOURCES.yaml``, nothing without a file; FileError names the source and the error."""
+    if path is None:
+        return NOTHING_STATED
     content = load_object(path, "sources", MAX_YAML_BYTES, _FORM, yaml=True)
     with named_errors(FileError, f"sources {str(path)!r}", ConfigurationError):
         return MachineSources(tuple(_stated(item) for item in content["sources"]))

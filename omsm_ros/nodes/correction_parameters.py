@@ -6,11 +6,7 @@ from typing import Any
 
 from omsm_ros import quantities
 from omsm_ros.core.correction.correct import CorrectionOptions
-from omsm_ros.core.correction.machine_sources import (
-    NOTHING_STATED,
-    MachineSources,
-    declared_sources,
-)
+from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S, CommonTrigger
@@ -113,8 +109,7 @@ def sources_of(values: Mapping[str, Any]) -> MachineSources:
     """Return the uncertainties of the machine, from the parameters, else from the file."""
     sizes = {f.name: values[f"sources.{f.name}"] for f in fields(ErrorSources)}
     by_parameter = declared_sources({name: size for name, size in sizes.items() if size})
-    path = values["sources_file"]
-    by_file = load_sources(path) if path else NOTHING_STATED
+    by_file = load_sources(values["sources_file"] or None)
     others = (said for said in by_file.stated if not by_parameter.of(said.source))
     return MachineSources((*by_parameter.stated, *others))
 
