@@ -47,7 +47,8 @@ _LIMIT = min(SAMPLED_LIMITS.gain, SAMPLED_LIMITS.phase)
 _LEAST_PREDICTED = 0.5
 # Least p-value of a residual that is independent of the input.
 _LEAST_INDEPENDENCE_P = 1e-4
-# Frequencies from the lowest line of the longest record on: neighbours are 2 to 3 % apart.
+# Frequencies from the lowest line of the longest record to the last below half the sampling rate,
+# where a pole may change the response that no line shows: neighbours are 2 to 3 % apart.
 _FREQUENCIES = 400
 # Number of lines in a block, added number for each input, largest ratio of its frequencies.
 _LINES, _LINES_PER_INPUT, _BLOCK_RATIO = 12, 8, 1.5
@@ -87,7 +88,8 @@ def identify_samples(
     records = [_checked(record) for record in records]
     choice = choose_sampled(records, hold, order=order, max_delay=max_delay)
     sections = _sections(choice.chosen, period)
-    frequency = np.geomspace(1 / max(len(record) for record in records), 0.5, _FREQUENCIES) / period
+    longest = max(len(record) for record in records)
+    frequency = np.geomspace(1, longest / 2 - 1, _FREQUENCIES) / (longest * period)
     sections, factor = _inflated_to_free_choice(sections, choice, frequency)
     blocks = _blocks(choice.chosen, period)
     corrected = sections.response(frequency) + _missed(choice.chosen, frequency * period)
