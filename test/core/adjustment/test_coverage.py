@@ -49,7 +49,6 @@ def test_a_scan_without_the_rim_agrees_where_both_have_points():
 
 
 @pytest.mark.soak
-@pytest.mark.timeout(300)
 def test_figures_lie_within_their_uncertainty(two_scans):
     """Of 32 PV, rms and lags at least 28 lie within k = 2 (P = 0.996 at 95 %)."""
     rows, _ = two_scans
@@ -60,7 +59,6 @@ def test_figures_lie_within_their_uncertainty(two_scans):
 
 
 @pytest.mark.soak
-@pytest.mark.timeout(300)
 def test_terms_lie_within_their_uncertainty(two_scans):
     """Of 384 Zernike terms 93 to 98 % lie within k = 2."""
     rows, _ = two_scans
@@ -70,7 +68,6 @@ def test_terms_lie_within_their_uncertainty(two_scans):
 
 
 @pytest.mark.soak
-@pytest.mark.timeout(300)
 def test_form_errors_are_as_large_as_stated(two_scans):
     rows, found = two_scans
     off = [row[4] / f.form.mean_uncertainty for row, f in zip(rows, found, strict=True)]
@@ -78,7 +75,6 @@ def test_form_errors_are_as_large_as_stated(two_scans):
 
 
 @pytest.mark.soak
-@pytest.mark.timeout(300)
 def test_clean_machines_are_verified(two_scans):
     """At least 93 % are verified; the drawn errors of the others are large by chance."""
     _, found = two_scans
@@ -88,7 +84,6 @@ def test_clean_machines_are_verified(two_scans):
 
 
 @pytest.mark.soak
-@pytest.mark.timeout(300)
 def test_single_clean_scans_refute_nothing():
     rows = []
     for seed in range(100, 120):
