@@ -12,9 +12,8 @@ wanders while it is estimated from arrivals. The error of that estimate is bound
 the earliest of n arrivals is late by about 1/n of their scatter, so it was by k/n of that when
 there were n/k.
 
-The delays of two devices may differ by half a period and more, and hide a slip in the skew. So a
-block of one stream that is stamped later than the one before by a whole number of periods is a
-slip, too, unless the other stream has the same step.
+The delays of two devices may differ by half a period and more, and hide a slip. So a median that
+differs from the usual one by ``period / 2 + 3 scatter`` is a slip, too.
 
 A pair waits until stamps of both streams that agree have come after it. At the start it waits for
 the first verdict, and after a stamp that is off for the verdict on the stamps that follow. Blocks
@@ -32,7 +31,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.stamps import PAUSE_NS, StampHistory, StampLine
 from omsm_ros.core.streams.statistics import median, spread_about_median
 from omsm_ros.errors import Notice
@@ -52,13 +51,6 @@ _LEAST_STAMPS = 8
 _SURE_STAMPS = 3
 # Time over which the scatter is also taken: the window of a driver's clock [s].
 _WANDER_S = 30.0
-# A step of stamps is a slip from the share of a period on; a longer one is a pause of the trigger.
-_STEP_PERIODS, _LONGEST_STEP_S = 0.7, 0.15
-# After this number of verdicts it is tested again whether this multiple of the largest step of a
-# clock, and of what it may still move, is below it; otherwise steps show nothing.
-_STEP_VERDICTS, _USUAL_STEPS = 5, 3.0
-# A skew within this of that before the step shows that it was none [samples].
-_RETURNED = 0.25
 # Stamps kept for a median; single-sample blocks at 1 kHz make 800 in a span.
 _MOST_STAMPS = 1024
 # Standard deviations of single stamps that the median of several does not reach.
@@ -167,9 +159,8 @@ class TriggerSlipDetector:
         self._seen = StampHistory(_MOST_STAMPS)
         # Skew at each verdict of the last half minute without a slip [ns].
         self._wander: deque[float] = deque(maxlen=round(_WANDER_S / _STRIDE_S))
-        # Net step of both streams [samples], its count, the skew before it [ns]; least step [ns].
-        self._stepped, self._stepped_at, self._before_step = 0, first, 0.0
-        self._least_steps, self._begun_at = [math.inf, math.inf], [first, first]
+        # The usual skew, and the change of a single one that may be a slip [ns].
+        self._usual, self._change = math.nan, math.inf
 
     @property
     def state(self) -> TriggerSlip:
@@ -212,8 +203,6 @@ class TriggerSlipDetector:
 
     def end(self) -> bool:
         """Return whether the pairs that still wait slipped, as far as their stamps show."""
-        if self._stepped:
-            return True
         since = self._start - 1 if self._starting else min(self._shown)
         few = self._starting and min(self._stamps) < _LEAST_STAMPS
         if (
@@ -245,15 +234,13 @@ class TriggerSlipDetector:
     def _observe(self, count: int, period_ns: float) -> None:
         """Take the skew at ``count``, where a block of either stream begins."""
         (axes, distance), (a, d) = self._lines, self.sessions
-        steps = axes.step_to(a, count, period_ns), distance.step_to(d, count, period_ns)
         begun = axes.advance(a, count), distance.advance(d, count)
         skew = axes.stamp_difference(distance, self.sessions, period_ns)
         if skew is None:
             self.same_stamps = False
             return
         self._period_ns, per_s = period_ns, NANOSECONDS_PER_S / period_ns
-        self._note_step(count, steps)
-        off = abs(skew) >= self._steady() * period_ns
+        off = bool(self._off(np.array(skew)))
         self._note(count, skew, begun, off)
         stride = int(count // max(_STRIDE_S * NANOSECONDS_PER_S / period_ns, 1.0))
         judged, self._judged = self._judged, stride
@@ -263,9 +250,7 @@ class TriggerSlipDetector:
                 self._since = count - _SPAN_S * per_s
                 self._judge(count)
             if not self._state.samples:
-                self._wander.append(skew)
-            if stride // _STEP_VERDICTS != judged // _STEP_VERDICTS:
-                self._set_least_steps()
+                self._note_usual(skew)
         time = axes.stamp_of(a, count, period_ns) or 0.0
         self._seen.add(count, skew, *begun, time)
         self._odd |= off and not early_days
@@ -277,71 +262,38 @@ class TriggerSlipDetector:
         for stream in (0, 1):
             if begun[stream]:
                 self._stamps[stream] += 1
-                self._begun_at[stream] = count
                 if not off:
                     self._shown[stream] = count
         if off:
             self._odd_at = count
 
-    def _note_step(self, count: int, steps: tuple[float, float]) -> None:
-        """Keep a step of the stamps of axes or distance [ns] that is a whole number of periods."""
-        net = 0
-        for step, least, sign in zip(steps, self._least_steps, (1, -1), strict=True):
-            if least <= abs(step) < _LONGEST_STEP_S * NANOSECONDS_PER_S:
-                net += sign * round(step / self._period_ns)
-        if not net:
-            return
-        if self._state.samples and not self._stepped:
-            self._before_step = 0.0  # it ends the slip only if the skew is then zero
-        elif not self._stepped:
-            rows = self._seen.after(count - _SPAN_S * NANOSECONDS_PER_S / self._period_ns)
-            self._before_step = median(rows[:, 1]) if len(rows) else 0.0
-        self._stepped, self._stepped_at = self._stepped + net, count
-        self._odd, self._odd_at = True, count
+    def _note_usual(self, skew: float) -> None:
+        """Keep a skew [ns] that is none of a slip; a slip in the newest ones is not found yet."""
+        self._wander.append(skew)
+        wander = np.array(self._wander)
+        if len(wander) >= 3 * _FOUND_IN:
+            self._usual = median(wander[-2 * _FOUND_IN : -_FOUND_IN])
+            scatter = max(spread_about_median(wander), _clock_uncertainty(wander))
+            self._change = self._period_ns / 2 + _SEVERAL_TIMES * scatter
 
-    def _set_least_steps(self) -> None:
-        """Take the least step of each stream that its scatter does not hide."""
-        rows, early = self._seen.rows, self._seen.rows[:, 0] < self._first_judged()
-        for stream in (0, 1):
-            which = rows[:, 2 + stream] > 0
-            later = which & ~early
-            begun = rows[later if np.sum(later) > _LEAST_STAMPS else which]
-            time = begun[:, 4] - stream * begun[:, 1]
-            steps = np.diff(time) - np.diff(begun[:, 0]) * self._period_ns
-            if len(steps) >= _LEAST_STAMPS:
-                moved = _clock_uncertainty(np.array(self._wander))
-                usual = _USUAL_STEPS * max(float(abs(steps).max()), moved)
-                least = _STEP_PERIODS * self._period_ns
-                self._least_steps[stream] = least if usual < least else math.inf
+    def _off(self, skew: FloatArray) -> BoolArray:
+        """Return which ``skew`` (n,) of single stamps [ns] may be of a slip."""
+        far = abs(skew) >= self._steady() * self._period_ns
+        return np.asarray(far | (abs(skew - self._usual) >= self._change))
 
     def _judge(self, count: int) -> None:
         if not (self._odd or self._state.samples or self._starting):
             return
         rows = self._recent()
-        if self._stepped and self._has_stepped(count, rows):
-            self._state = self.found = TriggerSlip(
-                self._stepped, 1, self._seen.rows[-1, 1] / NANOSECONDS_PER_S, self._trigger
-            )
-        elif rows is None or not self._seen.stamps_follow_counts(self._period_ns):
+        if rows is None or not self._seen.stamps_follow_counts(self._period_ns):
             self._state, self._odd = TriggerSlip(), True
             if rows is not None:
                 self._starting, self._judged_to = False, count  # stamps show nothing
         else:
-            window = rows[:, 1] / self._period_ns
-            self._state = self._verdict(window)
+            self._state = self._verdict(rows[:, 1] / self._period_ns)
             self._starting, self._judged_to = False, int(rows[0, 0])
-            self._odd = bool(np.any(abs(window) >= self._steady()))
+            self._odd = bool(np.any(self._off(rows[:, 1])))
             self.found = self._state if self._state.samples else self.found
-
-    def _has_stepped(self, count: int, rows: FloatArray | None) -> bool:
-        """Return whether the net step still holds, once both streams have shown theirs."""
-        if min(self._begun_at) < self._stepped_at:
-            return False
-        if rows is not None and rows[0, 0] > self._stepped_at:
-            moved = median(rows[:, 1]) - self._before_step
-            if abs(moved) < _RETURNED * self._period_ns:
-                self._stepped = 0
-        return self._stepped != 0
 
     def _recent(self) -> FloatArray | None:
         """Return the rows of :class:`StampHistory` to be judged; None if too few."""
@@ -362,9 +314,15 @@ class TriggerSlipDetector:
         return self._steady() + _SEVERAL_TIMES * scatter
 
     def _verdict(self, window: FloatArray) -> TriggerSlip:
-        limit, period = self._limit(window), self._period_ns / NANOSECONDS_PER_S
-        begun = self._steady() if self._state.samples else limit
-        found = TriggerSlip.judged(median(window), period, self._trigger, begun)
+        limit, skew, steady = self._limit(window), median(window), self._steady()
+        period, above = self._period_ns / NANOSECONDS_PER_S, limit - steady
+        if self._state.samples:
+            above = 0.0
+        found = TriggerSlip.judged(skew, period, self._trigger, steady + above)
+        change = skew - self._usual / self._period_ns
+        if abs(change) >= 0.5 + above:
+            samples = round(change) or int(math.copysign(1, change))
+            found = TriggerSlip(samples, 1, skew * period, self._trigger)
         return replace(found, seen_from=math.ceil(limit)) if found.samples else found
 
 

@@ -311,6 +311,19 @@ def test_a_link_known_to_be_late_is_tolerated() -> None:
     assert done.seen_from == 17
 
 
+@pytest.mark.parametrize("delay_ns", [300_000, 600_000])
+def test_a_slip_that_a_delay_of_the_link_hides_is_found_by_the_change(delay_ns: int) -> None:
+    """After a slip by a sample the stamps agree to 0.7 ms or 0.4 ms, which alone is none."""
+    late = [(_stamped(b, b.stamp_ns + delay_ns), n) for b, n in Device(ALL, jitter=1e-5).blocks()]
+    done = join(late, Device(ALL, 80, jitter=1e-5, seed=1).blocks())
+    assert set(done.slips) == {0}
+    probe = Device(without(ALL, 4010, 1), 80, jitter=1e-5, seed=1).blocks()
+    found = join(late, probe)
+    assert found.slips[-1] == -1
+    assert len(found.wrong) == 0
+    assert 3900 < len(found.axes) <= 4010
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_the_outcome_does_not_depend_on_how_the_streams_were_interleaved(seed: int) -> None:
     axes = Device(without(ALL, 1700, 10), 40, jitter=2e-4, seed=1).blocks()
