@@ -222,10 +222,13 @@ class Pairing:
         """Yield settled runs of axes and distance, of equal counts and length."""
         while (a := self.axes.head) is not None and (d := self.distance.head) is not None:
             order = self._order(a, d)
+            if order and not self._linked(a, d) and _apart(a, d):
+                if self._drop_misplaced(a, d):
+                    continue
+                skew_ns = a.stamp_of(d.first) - d.stamp_ns
+                self.watch.apart(skew_ns, len(a if order < 0 else d), a.period_ns)
             if order == 0:
                 yield from self._joined(a, d)
-            elif not self._linked(a, d) and _apart(a, d) and self._drop_misplaced(a, d):
-                continue
             elif order < 0:
                 samples = self._samples_before(a, d.first, a, d)
                 self.axes.drop(samples, _missing(a, self.distance))

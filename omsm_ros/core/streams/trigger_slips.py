@@ -77,6 +77,8 @@ EQUAL_COUNTS = CommonTrigger()
 
 # Two stamps of one trigger by one driver differ by rounding only [ns].
 _SAME_NS = 2.0
+# Samples without a partner that show that the counters do not agree [s].
+_APART_S = 2.0
 # Time after which pairs are released without a first verdict, where blocks are too long [s].
 _MOST_WAIT_S = 10.0
 
@@ -143,6 +145,7 @@ class TriggerSlipDetector:
         self._lines = (axes, distance)
         self._trigger = trigger
         self.found: TriggerSlip | None = None
+        self._apart_ns, self._apart = 0.0, TriggerSlip()  # since the last pair
         self._restart((-1, -1), 0)
 
     def _restart(self, sessions: tuple[int, int], first: int) -> None:
@@ -164,13 +167,20 @@ class TriggerSlipDetector:
 
     @property
     def state(self) -> TriggerSlip:
-        """The last verdict."""
-        if self._state.samples:
-            return self._state
+        """The last verdict, also on counters so far apart that there are no pairs."""
+        if self._apart.samples or self._state.samples:
+            return self._apart if self._apart.samples else self._state
         rows = self._recent()
         if rows is None or not self._seen.stamps_follow_counts(self._period_ns):
             return TriggerSlip()
         return TriggerSlip(seen_from=math.ceil(self._limit(rows[:, 1] / self._period_ns)))
+
+    def apart(self, skew_ns: float, samples: int, period_ns: float) -> None:
+        """Judge counters at whose equal counts ``samples`` find no partner of the same time."""
+        self._apart_ns += samples * period_ns
+        if self._apart_ns > _APART_S * NANOSECONDS_PER_S:
+            skew = skew_ns / period_ns
+            self._apart = TriggerSlip(round(skew), 1, skew_ns / NANOSECONDS_PER_S, self._trigger)
 
     def settled(
         self, sessions: tuple[int, int], first: int, end: int, period_ns: float
@@ -179,6 +189,7 @@ class TriggerSlipDetector:
 
         Yield counts up to which waiting pairs are settled, with True where they slipped.
         """
+        self._apart_ns, self._apart = 0.0, TriggerSlip()
         if sessions != self.sessions:
             self._restart(sessions, first)
         for line, session in zip(self._lines, sessions, strict=True):

@@ -129,6 +129,25 @@ def test_diagnostics_say_what_slipped_and_what_to_do(
     assert report.values["axes_slipped"] == report.values["distance_slipped"]
 
 
+@pytest.mark.parametrize("begins", [0, 2000])
+def test_a_counter_that_begins_anew_alone_is_reported_with_the_remedy(
+    scan: Recording, begins: int
+) -> None:
+    """begins: trigger from which the probe has counted before, none or by a power cycle."""
+    axes = cut(part(scan.axes, 0, 9000), range(0, 9000, 50))
+    probe = cut(part(scan.distance, 0, 9000), range(0, 9000, 50))
+    restarted = [shifted(block, -2000, 0.0) for block in probe[40:180]]
+    _, _, corrector = corrected(axes, [*probe[: begins // 50], *restarted], 4, CorrectionOptions())
+    report = CorrectionState().report(corrector, 0.0, 0.0)
+    assert report.level == ERROR
+    assert "slipped by -2000 samples" in report.text
+    assert "'counter_offset' 2000" in report.text
+    stated = CorrectionOptions(trigger=CommonTrigger(counter_offset=2000))
+    _, account, corrector = corrected(axes, restarted, 4, stated)
+    assert corrector.slips.state.samples == 0
+    assert account.axes.corrected > 6900
+
+
 def test_a_stated_offset_gives_the_same_surface(scan: Recording) -> None:
     axes, distance = part(scan.axes, 0, 3000), part(scan.distance, 0, 3000)
     plain, _, _ = corrected([axes], [distance], 0, CorrectionOptions())
