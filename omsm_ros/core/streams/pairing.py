@@ -177,9 +177,9 @@ class RunQueue:
             excess = min(self.pending - samples, len(self._runs[0]))
             self.given_up = self.drop(excess, RejectionReason.OVERDUE)
 
-    def clear(self) -> None:
-        """Drop all waiting samples as unmatched."""
-        while self._runs:
+    def clear(self, runs: int | None = None) -> None:
+        """Drop the oldest ``runs`` as unmatched, None: all that wait."""
+        for _ in range(len(self._runs) if runs is None else runs):
             self.drop(len(self._runs[0]))
 
     def misplaced_runs(self, other: SampleRun) -> int:
@@ -221,20 +221,19 @@ class Pairing:
     def pairs(self) -> Iterator[tuple[SampleRun, SampleRun]]:
         """Yield settled runs of axes and distance, of equal counts and length."""
         while (a := self.axes.head) is not None and (d := self.distance.head) is not None:
-            order = self._order(a, d)
-            if order and not self._linked(a, d) and _apart(a, d):
-                if self._drop_misplaced(a, d):
-                    continue
-                skew_ns = a.stamp_of(d.first) - d.stamp_ns
-                self.watch.apart(skew_ns, len(a if order < 0 else d), a.period_ns)
+            order, linked = self._order(a, d), self._linked(a, d)
             if order == 0:
                 yield from self._joined(a, d)
-            elif order < 0:
-                samples = self._samples_before(a, d.first, a, d)
-                self.axes.drop(samples, _missing(a, self.distance))
-            else:
-                samples = self._samples_before(d, a.first, a, d)
-                self.distance.drop(samples, _missing(d, self.axes))
+                continue
+            queue, run, others, other = self.axes, a, self.distance, d
+            if order > 0:
+                queue, run, others, other = others, other, queue, run
+            if not linked and _apart(a, d):
+                if self._drop_misplaced(a, d):
+                    continue
+                self.watch.apart(a.stamp_of(d.first) - d.stamp_ns, len(run), run.period_ns)
+            samples = min(other.first - run.first, len(run)) if linked else len(run)
+            queue.drop(samples, _missing(run, others))
 
     def end(self) -> Iterator[tuple[SampleRun, SampleRun]]:
         """Settle the pairs that still wait by the stamps there are, and yield them."""
@@ -261,12 +260,10 @@ class Pairing:
                 stop = until - first
                 self._held.appendleft((a.part(stop, len(a)), d.part(stop, len(d))))
                 a, d = a.part(0, stop), d.part(0, stop)
-            if slipped:
-                self.axes.settle(a, np.uint8(RejectionReason.SLIPPED))
-                self.distance.settle(d, np.uint8(RejectionReason.SLIPPED))
-            else:
-                self.axes.settle(a, d.reasons)
-                self.distance.settle(d, a.reasons)
+            refused = np.uint8(RejectionReason.SLIPPED)
+            self.axes.settle(a, refused if slipped else d.reasons)
+            self.distance.settle(d, refused if slipped else a.reasons)
+            if not slipped:
                 yield a, d
 
     def _drop_misplaced(self, a: SampleRun, d: SampleRun) -> bool:
@@ -278,17 +275,9 @@ class Pairing:
         axes, distance = self.axes.misplaced_runs(d), self.distance.misplaced_runs(a)
         if bool(axes) == bool(distance):
             return False
-        stream = self.axes if axes else self.distance
-        for _ in range(axes or distance):
-            assert stream.head is not None
-            stream.drop(len(stream.head))
+        self.axes.clear(axes)
+        self.distance.clear(distance)
         return True
-
-    def _samples_before(self, run: SampleRun, other_first: int, a: SampleRun, d: SampleRun) -> int:
-        """Return the number of samples before the other head, all if sessions are not linked."""
-        if not self._linked(a, d):
-            return len(run)
-        return min(other_first - run.first, len(run))
 
     def _linked(self, a: SampleRun, d: SampleRun) -> bool:
         return (a.session, d.session) == self._link

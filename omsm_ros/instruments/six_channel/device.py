@@ -189,9 +189,6 @@ def make_text(values: Values, transport: Transport, now_ns: NowNs, **more: Any) 
 #
 # Tested against the test server of pyads, not on hardware.
 
-_DEFAULT_SYMBOL = "GVL.omsm"
-_DEFAULT_SAMPLES = 1000
-
 _WRITTEN_SIZE = 8
 # At 1 kHz this gives twenty samples at a time, and a ring of a thousand holds a second [s].
 _POLL_S = 0.02
@@ -212,14 +209,13 @@ class AdsRing:
     def __init__(self, address: str) -> None:
         """Raise ConfigurationError for an address that is not valid."""
         parts = parts_of(address)
-        query = parse_qs(parts.query)
-        samples = query.get("samples", [str(_DEFAULT_SAMPLES)])[0]
+        query = {"symbol": ["GVL.omsm"], "samples": ["1000"]} | parse_qs(parts.query)
+        samples = query["samples"][0]
         usable = samples.isdecimal() and 0 < int(samples[:9]) <= _MOST_SAMPLES
-        known = set(query) <= {"symbol", "samples"}
-        if parts.scheme != "ads" or not parts.hostname or not known or not usable:
+        if parts.scheme != "ads" or not parts.hostname or len(query) != 2 or not usable:
             raise ConfigurationError(
-                f"address {address!r}, expected ads://host:851/1.2.3.4.1.1?symbol={_DEFAULT_SYMBOL}"
-                f"&samples={_DEFAULT_SAMPLES}, with at most {_MOST_SAMPLES} samples"
+                f"address {address!r}, expected ads://host:851/1.2.3.4.1.1?symbol=GVL.omsm"
+                f"&samples=1000, with at most {_MOST_SAMPLES} samples"
             )
         self.name = address
         self._host = parts.hostname
@@ -228,7 +224,7 @@ class AdsRing:
             self._port = parts.port or 851
         except ValueError as err:
             raise ConfigurationError(f"address {address!r}: {err}") from err
-        self._symbol = query.get("symbol", [_DEFAULT_SYMBOL])[0]
+        self._symbol = query["symbol"][0]
         self._capacity = int(samples)
         self._size = _WRITTEN_SIZE + self._capacity * BODY_SIZE
         self._plc: Any = None
