@@ -51,8 +51,11 @@ def load_limits(path: Path | str | None) -> MachineLimits:
     return _load(MachineLimits, path, "limits")
 
 
-def load_disturbances(path: Path | str) -> Disturbances:
-    """Read ``DISTURBANCES.yaml``, the errors of the twin; a record left out is switched off."""
+def load_disturbances(path: Path | str | None) -> Disturbances:
+    """Read ``DISTURBANCES.yaml``, the errors of the twin, none without a file.
+
+    A record that is left out is switched off.
+    """
     from omsm_ros.twin.disturbances import Disturbances
 
     return _load(Disturbances, path, "disturbances")

@@ -296,6 +296,3 @@ def _origin(recorded_ns: int | None) -> Origin:
 
 
 main = partial(run, CalibratorNode)
-
-if __name__ == "__main__":
-    main()

@@ -407,7 +407,3 @@ def main() -> None:
     finally:
         rclpy.try_shutdown()
     print(json.dumps(summary) if args.json else table_of(plan, summary))
-
-
-if __name__ == "__main__":
-    main()

@@ -30,7 +30,6 @@ from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, serve
 from omsm_ros.nodes.topics import every
 from omsm_ros.quantities import Parameter
-from omsm_ros.twin.disturbances import NOTHING
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, verifying_scan_of
 from omsm_ros.twin.sensors import ReferenceSensor
 
@@ -90,8 +89,7 @@ class CellEmulatorNode(ManagedNode):
         """Offer the port, and answer requests."""
         values = self.values
         self._scenario = Scenario(**{p.name: values[p.name] for p in _SCENARIO})
-        file = values["disturbances"]
-        self._disturbances = load_disturbances(file) if file else NOTHING
+        self._disturbances = load_disturbances(values["disturbances"] or None)
         second = emulated(values["device"]).second
         if second and second.node == "reference_driver" and not self._disturbances.reference:
             self._disturbances = replace(self._disturbances, reference=ReferenceSensor())
@@ -193,6 +191,3 @@ class CellEmulatorNode(ManagedNode):
 
 
 main = partial(run, CellEmulatorNode)
-
-if __name__ == "__main__":
-    main()

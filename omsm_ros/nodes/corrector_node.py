@@ -34,7 +34,7 @@ from omsm_ros.nodes import topics
 from omsm_ros.nodes.background_worker import BackgroundWorker, Goal, serve_action
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, options_of, sources_of
-from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, StateReport
+from omsm_ros.nodes.diagnostics import ERROR, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, every, listen, take_rest
@@ -44,8 +44,6 @@ from omsm_ros.report.verdict import next_steps
 # A motion has paused after this time without a block, or the duration of three blocks [s].
 PAUSE_S, _PAUSE_BLOCKS = 1.0, 3
 _STREAMS = {"axes": ("axes", AxisBlock), "distance": ("confocal", DistanceBlock)}
-# Silence before a report: longer than the pauses of a step test, or five samples [s].
-_SILENCE_S, _SILENCE_SAMPLES = 2.0, 5
 # At the end, drivers send their last block within the time of so many looks.
 _LAST_LOOKS = 20
 # Half of the two seconds for which small blocks can wait [ms].
@@ -170,12 +168,9 @@ class CorrectionState:
         for stream, flow in self._flows.items():
             flow.update(self._heard[stream], now)
             report.values[f"rate_hz_{stream}"] = round(flow.rate, 3)
-            silent = flow.silent(now)
-            patience = max(_SILENCE_S, _SILENCE_SAMPLES * self._period[stream])
-            if silent is None:
-                report.add(STALE, f"no sample of {stream} yet")
-            elif silent > patience:
-                report.add(STALE, f"no sample of {stream} for {silent:.0f} s")
+            none = f"no sample of {stream}"
+            silent, period = flow.silent(now), self._period[stream]
+            report.add_silence(silent, period, f"{none} for {{:.0f}} s", f"{none} yet")
 
 
 def _add_motion(report: StateReport, slip: TriggerSlip, motion: LiveOffset) -> None:
@@ -458,6 +453,3 @@ def _prediction(*motion: Any) -> Prediction:
 
 
 main = partial(run, CorrectorNode)
-
-if __name__ == "__main__":
-    main()

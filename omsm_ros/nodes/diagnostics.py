@@ -21,6 +21,8 @@ STALE = DiagnosticStatus.STALE
 
 _SEVERITY = (OK, WARN, STALE, ERROR)
 _COMPLAINT_PERIOD_S = 5.0
+# Silence before a report: longer than the pauses of a step test, or five samples [s].
+_SILENCE_S, _SILENCE_PERIODS = 2.0, 5
 # Number of internal errors of a node, and the line of the last one.
 _defects: dict[str, tuple[int, str]] = {}
 
@@ -36,6 +38,17 @@ class StateReport:
     def add(self, level: bytes, text: str) -> None:
         """Add a present finding."""
         self.findings.append((level, text))
+
+    def add_silence(self, silent: float | None, period: float, text: str, never: str = "") -> None:
+        """Add ``text``, with the seconds, if ``silent`` is longer than usual.
+
+        silent: time since the last sample [s];  None = before the first: add ``never`` if any
+        period: usual time between two samples [s]
+        """
+        if silent is None:
+            self.findings += [(STALE, never)] * bool(never)
+        elif silent > max(_SILENCE_S, _SILENCE_PERIODS * period):
+            self.add(STALE, text.format(silent))
 
     @property
     def level(self) -> bytes:

@@ -31,7 +31,7 @@ from omsm_ros.instruments.stream import StreamDevice
 from omsm_ros.io import json_and_yaml, message_mapping
 from omsm_ros.io.figure_messages import probe_message
 from omsm_ros.nodes.background_worker import BackgroundWorker
-from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, StateReport
+from omsm_ros.nodes.diagnostics import ERROR, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run
 from omsm_ros.nodes.topics import FRAME_PREFIX, LATCHED_QOS, publish_on
@@ -49,9 +49,6 @@ _FAULTS = (
     "missed",
     "overruns",
 )
-# The pauses between two motions of a step test are shorter [s].
-_SILENCE_S = 2.0
-_SILENCE_SAMPLES = 5
 _END_S = 5.0
 # A dark reference takes some three seconds; more if the device is slow to answer.
 _DARK_REFERENCE_S = 30.0
@@ -165,7 +162,10 @@ class DriverNode(ManagedNode):
         if caution := self._device.caution:
             report.add(WARN, caution)
         self._add_faults(report, counts, now)
-        self._add_silence(report, now)
+        if self._reader.state is State.READING:
+            silent, never = self._flow.silent(now), "connected, but no sample has come yet"
+            period = self.values["sample_period"]
+            report.add_silence(silent, period, "no sample for {:.0f} s", never)
         return report
 
     def _add_faults(self, report: StateReport, counts: dict[str, float], now: float) -> None:
@@ -175,16 +175,6 @@ class DriverNode(ManagedNode):
         if seen := self._recent.update(faults, now):
             text = ", ".join(f"{name} {rise:.0f}" for name, rise in seen.items())
             report.add(WARN, f"just now: {text}")
-
-    def _add_silence(self, report: StateReport, now: float) -> None:
-        if self._reader.state is not State.READING:
-            return
-        patience = max(_SILENCE_S, _SILENCE_SAMPLES * self.values["sample_period"])
-        silent = self._flow.silent(now)
-        if silent is None:
-            report.add(STALE, "connected, but no sample has come yet")
-        elif silent > patience:
-            report.add(STALE, f"no sample for {silent:.0f} s")
 
 
 class ConfocalDriverNode(DriverNode):

@@ -16,14 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from omsm_msgs.msg import AxisBlock, Calibration, DistanceBlock
 from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.task import Future
 from rosgraph_msgs.msg import Clock as ClockMessage
-from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from omsm_ros import quantities
@@ -35,7 +32,14 @@ from omsm_ros.io.topics import CellBag, relative
 from omsm_ros.nodes.diagnostics import ERROR, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, serve
-from omsm_ros.nodes.topics import LATCHED_QOS, PROCESSED, SAMPLES_QOS, every, publish_on
+from omsm_ros.nodes.topics import (
+    LATCHED_QOS,
+    PROCESSED,
+    SAMPLES_QOS,
+    every,
+    publish_on,
+    recorded_type,
+)
 from omsm_ros.quantities import Parameter
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -253,16 +257,9 @@ PARAMETERS = (
 RECORDED_POINTS = "recorded/points"
 """Topic of recorded points, apart from those that are corrected now."""
 
-_TYPES = {
-    topics.AXES_TOPIC: AxisBlock,
-    topics.DISTANCE_TOPIC: DistanceBlock,
-    topics.REFERENCE_TOPIC: DistanceBlock,
-    topics.CALIBRATION_TOPIC: Calibration,
-    topics.POINTS_TOPIC: PointCloud2,
-    topics.PROBE_TOPIC: String,
-}
 _NEEDED = (topics.AXES_TOPIC, topics.DISTANCE_TOPIC)
 _SAMPLES = (*_NEEDED, topics.REFERENCE_TOPIC)
+_PLAYED = (*_SAMPLES, topics.CALIBRATION_TOPIC, topics.POINTS_TOPIC, topics.PROBE_TOPIC)
 _TICK_S = 0.005
 _LATE_S = 1.0
 # An answer may take this long on a busy computer; it is lost if the node ends before [s].
@@ -294,7 +291,7 @@ class PlayerNode(ManagedNode):
         self._asked_at = float("-inf")
 
     def _asked_for(self) -> list[str]:
-        held = [t.role for t in self._bag.topics() if t.role in _TYPES and t.messages]
+        held = [t.role for t in self._bag.topics() if t.role in _PLAYED and t.messages]
         names = self.values["topics"].split() or [
             relative(topic) for topic in held if topic != topics.POINTS_TOPIC
         ]
@@ -310,9 +307,10 @@ class PlayerNode(ManagedNode):
 
     def _publisher(self, undo: ExitStack, topic: str) -> Publisher:
         name = RECORDED_POINTS if topic == topics.POINTS_TOPIC else relative(topic)
+        kind = recorded_type(topic)
         if topic in topics.LATCHED_TOPICS:  # other nodes may publish it too
-            return publish_on(self, undo, _TYPES[topic], name, LATCHED_QOS)
-        return self.publish_on(undo, _TYPES[topic], name, SAMPLES_QOS)
+            return publish_on(self, undo, kind, name, LATCHED_QOS)
+        return self.publish_on(undo, kind, name, SAMPLES_QOS)
 
     def activate(self, undo: ExitStack) -> None:
         """Play."""
@@ -473,6 +471,3 @@ class PlayerNode(ManagedNode):
 
 
 main = partial(run, PlayerNode)
-
-if __name__ == "__main__":
-    main()

@@ -6,10 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from omsm_msgs.msg import AccelerationBlock, AxisBlock, Calibration, DistanceBlock
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import PointCloud2, Temperature
-from std_msgs.msg import String
 
 from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.io import topics
@@ -17,25 +14,21 @@ from omsm_ros.io.bag_writer import BagWriter, next_free
 from omsm_ros.nodes.diagnostics import ERROR, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run
-from omsm_ros.nodes.topics import LATCHED_QOS, SAMPLES_QOS, MessageInfo, every, listen, take_rest
+from omsm_ros.nodes.topics import (
+    LATCHED_QOS,
+    SAMPLES_QOS,
+    MessageInfo,
+    every,
+    listen,
+    recorded_type,
+    take_rest,
+)
 from omsm_ros.quantities import Parameter
 
 PARAMETERS = (
     Parameter("path", "", "the .mcap file to write; it must not exist yet", required=True),
     Parameter("numbered", False, "if it exists, write scan.2.mcap, scan.3.mcap, … instead"),
 )
-_TOPICS = {
-    topics.AXES_TOPIC: AxisBlock,
-    topics.DISTANCE_TOPIC: DistanceBlock,
-    topics.REFERENCE_TOPIC: DistanceBlock,
-    topics.ACCELERATION_TOPIC: AccelerationBlock,
-    topics.CALIBRATION_TOPIC: Calibration,
-    topics.POINTS_TOPIC: PointCloud2,
-    topics.PROBE_TOPIC: String,
-    topics.VIBRATION_TOPIC: String,
-    topics.TEMPERATURE_TOPIC: Temperature,
-}
-
 _FLUSH_PERIOD_S = 0.5
 # Longer than the corrector waits for its last samples, whose points come after that.
 _LOOKS = 40
@@ -59,23 +52,23 @@ class RecorderNode(ManagedNode):
             raise ConfigurationError(f"path {str(path)!r} must name an .mcap file")
         if self.values["numbered"]:
             path = next_free(path)
-        self._names = {t: self.resolve_topic_name(t.rpartition("/")[2]) for t in _TOPICS}
+        self._names = {t: self.resolve_topic_name(t.rpartition("/")[2]) for t in topics.TOPIC_TYPES}
         self._counts = dict.fromkeys(self._names.values(), 0)
-        self._lost = dict.fromkeys(_TOPICS, 0)
+        self._lost = dict.fromkeys(topics.TOPIC_TYPES, 0)
         self._last_stamp = 0
         self._heard: dict[str, Subscription] = {}
-        self._bag = BagWriter(path, tuple(_TOPICS), self._names)
+        self._bag = BagWriter(path, tuple(topics.TOPIC_TYPES), self._names)
         self._bag.__enter__()
         undo.callback(self._complete)
 
     def activate(self, undo: ExitStack) -> None:
         """Begin to record; at the end, take the messages published before it."""
-        for topic, kind in _TOPICS.items():
+        for topic in topics.TOPIC_TYPES:
             qos = LATCHED_QOS if topic in topics.LATCHED_TOPICS else SAMPLES_QOS
             self._heard[topic] = listen(
                 self,
                 undo,
-                kind,
+                recorded_type(topic),
                 self._names[topic],
                 partial(self._take, topic),
                 qos,
@@ -131,7 +124,3 @@ class RecorderNode(ManagedNode):
 
 main = partial(run, RecorderNode)
 """``ros2 run omsm_ros recorder``; exit code 2 without space on the disk."""
-
-
-if __name__ == "__main__":
-    main()

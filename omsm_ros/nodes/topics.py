@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from copy import copy
+from importlib import import_module
 from typing import Any, TypeAlias
 
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
@@ -25,6 +26,7 @@ from omsm_ros import quantities
 from omsm_ros.core.kinematics.kinematics import Geometry, beam_quaternion
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import json_and_yaml
+from omsm_ros.io.topics import TOPIC_TYPES
 from omsm_ros.quantities import Parameter
 
 MessageInfo: TypeAlias = "dict[str, int]"
@@ -55,6 +57,12 @@ _processed: Counter[str] = Counter()
 
 # Most messages taken in a row, so that timers and services are not delayed.
 _BULK = 500
+
+
+def recorded_type(topic: str) -> Any:
+    """Return the type of a topic's messages, by its name in a bag."""
+    package, _, name = TOPIC_TYPES[topic].split("/")
+    return getattr(import_module(f"{package}.msg"), name)
 
 
 def every(node: Node, undo: ExitStack, period_s: float, do: Callable[[], object]) -> Timer:

@@ -32,8 +32,6 @@ from omsm_ros.nodes.topics import MessageInfo, listen, publish_on
 from omsm_ros.quantities import Parameter
 from omsm_ros.readable import quantity
 
-_SILENCE_S, _SILENCE_BLOCKS = 2.0, 5
-
 PARAMETERS = (
     Parameter("bands", "5 50 150 500 2000", "edges of the bands, rising [Hz]"),
     Parameter("window", 1.0, "length of a spectrum [s]", quantities.WAIT),
@@ -142,19 +140,15 @@ class VibrationMonitorNode(ManagedNode):
                                  f"{self._line(levels)}")  # fmt: skip
             if levels.effect is None:
                 report.add(WARN, "effect on a height not evaluated: no calibration yet")
-        self._add_silence(report, time.monotonic())
+        now = time.monotonic()
+        self._flow.update(running.received, now)
+        text = "no acceleration for {:.0f} s; the levels are of before"
+        report.add_silence(self._flow.silent(now), self._block, text)
         refused = {"blocks_refused": self._blocks_refused}
         report.values |= refused
-        if self._lately.update(refused, time.monotonic()):
+        if self._lately.update(refused, now):
             report.add(WARN, f"a block was refused: {self._refused}")
         return report
-
-    def _add_silence(self, report: StateReport, now: float) -> None:
-        """StateReport a silence: the levels are of before."""
-        self._flow.update(self._running.received, now)
-        silent = self._flow.silent(now)
-        if silent is not None and silent > max(_SILENCE_S, _SILENCE_BLOCKS * self._block):
-            report.add(STALE, f"no acceleration for {silent:.0f} s; the levels are of before")
 
 
 def _figures(levels: Any) -> dict[str, object]:
@@ -184,6 +178,3 @@ def _edges(text: str) -> tuple[float, ...]:
 
 
 main = partial(run, VibrationMonitorNode)
-
-if __name__ == "__main__":
-    main()

@@ -130,6 +130,3 @@ def load_token(path: str) -> str:
 
 
 main = partial(run, ViewerNode)
-
-if __name__ == "__main__":
-    main()

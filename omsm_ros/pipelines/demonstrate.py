@@ -49,7 +49,7 @@ from omsm_ros.pipelines.record_bags import NOMINAL, write_nominal
 from omsm_ros.readable import quantity
 from omsm_ros.report.verdict import headline
 from omsm_ros.twin.cell import Probe, Recording, compare_with_truth
-from omsm_ros.twin.disturbances import NOTHING, Disturbances, TrueResponse
+from omsm_ros.twin.disturbances import Disturbances, TrueResponse
 from omsm_ros.twin.part import FigureError
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of, verifying
 from omsm_ros.units import PPM
@@ -134,7 +134,7 @@ class Demonstration:
     @cached_property
     def disturbances(self) -> Disturbances:
         """Errors of the emulated machine."""
-        return load_disturbances(self.disturbance_file) if self.disturbance_file else NOTHING
+        return load_disturbances(self.disturbance_file)
 
     @property
     def link(self) -> str:

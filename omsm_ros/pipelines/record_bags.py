@@ -27,7 +27,6 @@ from omsm_ros.io.topics import AXES_TOPIC, DISTANCE_TOPIC
 from omsm_ros.pipelines.progress import state_progress
 from omsm_ros.readable import count, quantity
 from omsm_ros.twin.cell import Recording, blocks_of, pieces
-from omsm_ros.twin.disturbances import NOTHING
 from omsm_ros.twin.scenario import (
     MIRROR_APERTURE,
     Scenario,
@@ -131,7 +130,7 @@ def record_twin(
     ConfigurationError for a scan beyond the mirror or too long for memory.
     """
     _check(scenario)
-    wrong = NOTHING if disturbance_file is None else load_disturbances(disturbance_file)
+    wrong = load_disturbances(disturbance_file)
     steps = _write(out / STEPS, planned_test_of(scenario, wrong))
     scan = _write(out / SCAN, scan_of(scenario, wrong))
     write_nominal(out / NOMINAL, scenario.start_radius > PAPER_MIRROR_RADIUS_M)
@@ -143,7 +142,7 @@ def record_sources(
     out: Path, scenario: Scenario, kinds: Sequence[str], disturbance_file: Path | None = None
 ) -> dict[str, int]:
     """Write a bag for each of ``kinds``; return its samples. BagError if one exists."""
-    wrong = NOTHING if disturbance_file is None else load_disturbances(disturbance_file)
+    wrong = load_disturbances(disturbance_file)
     bags_of = {kind: out / f"{kind}.mcap" for kind in kinds}
     return {
         str(path): _write(path, source_recording(kind, scenario, wrong))

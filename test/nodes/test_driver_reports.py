@@ -36,7 +36,7 @@ class Driver(SimpleNamespace):
 
     report, _publish = DriverNode.report, DriverNode._publish
     _publish_settings = DriverNode._publish_settings
-    _add_faults, _add_silence = DriverNode._add_faults, DriverNode._add_silence
+    _add_faults = DriverNode._add_faults
     hardware_id = DriverNode.hardware_id
 
 

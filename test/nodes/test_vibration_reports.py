@@ -30,7 +30,7 @@ class Monitor(SimpleNamespace):
 
     _take, _levels = VibrationMonitorNode._take, VibrationMonitorNode._levels
     _line = VibrationMonitorNode._line
-    report, _add_silence = VibrationMonitorNode.report, VibrationMonitorNode._add_silence
+    report = VibrationMonitorNode.report
     _use = VibrationMonitorNode._use
 
     def get_logger(self):
