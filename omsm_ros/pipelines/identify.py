@@ -136,7 +136,7 @@ def write_model_page(
     source: name of the record, as the page states it
     """
     # Imported on demand, because loading the figures takes a second.
-    from omsm_ros.report.certificate.model_page import model_figures_of, render_model
+    from omsm_ros.report.certificate.page import model_figures_of, render_model
     from omsm_ros.report.page_parts import Issue
 
     figures = model_figures_of(model, record.inputs, record.output, run)

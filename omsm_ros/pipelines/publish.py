@@ -47,7 +47,6 @@ def view_of(cloud: NDArray[np.void], sample_period: float) -> CloudView | None:
         x=cloud["x"].astype(np.float64),
         y=cloud["y"].astype(np.float64),
         height=cloud["height"].astype(np.float64),
-        raw_height=cloud["height"] + error,
         dynamic_error=error,
         uncertainty=cloud["uncertainty"].astype(np.float64),
     )

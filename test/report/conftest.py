@@ -35,7 +35,6 @@ def cloud(mirror):
         x=x,
         y=y,
         height=height,
-        raw_height=height + error,
         dynamic_error=error,
         uncertainty=np.full(POINTS, 11e-9),
     )

@@ -20,8 +20,8 @@ from omsm_ros.core.ripple.source_hypotheses import KINDS
 from omsm_ros.live_page.server import render as render_live
 from omsm_ros.report.campaign import CampaignEntry
 from omsm_ros.report.campaign import render as render_campaign
-from omsm_ros.report.certificate.model_page import render_model
 from omsm_ros.report.certificate.page import render as render_certificate
+from omsm_ros.report.certificate.page import render_model
 from omsm_ros.report.experiments import Compared, done
 from omsm_ros.report.measurement.page import CAPTIONS, Report
 from omsm_ros.report.measurement.page import render as render_report

@@ -1,139 +1,31 @@
-"""The certificate of a calibration as a page to file: HTML in one piece."""
+"""Pages to file, each HTML in one piece: certificate of a calibration, and a sampled model."""
 
+from collections.abc import Mapping
 from datetime import datetime, timezone
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import REJECTED, Certificate, to_json
+from omsm_ros.core.estimation.sampled_model import SCHEMA, FreeRun, SampledModel
 from omsm_ros.core.identification.fitted_record import FittedRecord
 from omsm_ros.core.lti.frequency_response import (
     COVERAGE_FACTOR,
     low_frequency_delay_uncertainty,
     response_band,
 )
-from omsm_ros.core.lti.modes import KnownMode, known_modes
-from omsm_ros.core.model_errors.families import CREEP, MODE
-from omsm_ros.readable import NOTHING, measured, percent, plain, quantity
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.readable import NOTHING, count, measured, percent, plain, probability, quantity
 from omsm_ros.report import style
 from omsm_ros.report.certificate import figures as certificate_figures
 from omsm_ros.report.certificate import tables
 from omsm_ros.report.certificate.tables import known_rows
 from omsm_ros.report.page_parts import Headline, Issue, Section, fill, picture, present, title_block
 from omsm_ros.report.response_figures import step_response
-from omsm_ros.report.tables import Table, latency_text, mapping_table
+from omsm_ros.report.tables import Table, latency_text, mapping_table, part
 from omsm_ros.report.verdict import PageVerdict, verdict_text
-from omsm_ros.units import DEGREE_RAD, MILLISECOND_S, NANOSECONDS_PER_S, PPM
-
-
-def mode_table(calibration: Calibration) -> Table:
-    """Return the poles as terms of Eq. 8, and whether the band reaches them."""
-    modes = known_modes(calibration.dynamics, calibration.covariance)
-    rows = [
-        (
-            f"mode {index}" if mode.residue is not None else f"real pole {index}",
-            *_resolved(mode, calibration),
-            "yes" if mode.frequency <= calibration.valid_up_to else "no",
-        )
-        for index, mode in enumerate(modes, start=1)
-    ]
-    columns = ("frequency", "damping ratio", "residue [1/ms²]", "within the valid range")
-    return Table("Modes (Eq. 8)", columns, rows)
-
-
-def _resolved(mode: KnownMode, calibration: Calibration) -> tuple[str, str, str]:
-    """Return frequency, damping and residue; a pole beyond the sampling rate is not resolved."""
-    known, fastest = calibration.valid_up_to, 1 / calibration.sample_period
-    if mode.frequency > known and mode.frequency_uncertainty >= mode.frequency:
-        fastest = known
-    if mode.frequency > fastest:
-        return f"not resolved (faster than {quantity(fastest, 'Hz')})", "unknown", "unknown"
-    return (measured(mode.frequency, mode.frequency_uncertainty, "Hz"), *_oscillation(mode))
-
-
-def _oscillation(mode: KnownMode) -> tuple[str, str]:
-    if mode.residue is None or mode.residue_uncertainty is None:
-        return "1, by definition", "none"
-    residue, spread = (v * MILLISECOND_S**2 for v in (mode.residue, mode.residue_uncertainty))
-    return measured(mode.damping, mode.damping_uncertainty), measured(residue, spread)
-
-
-_MECHANICAL_UNITS = {"m1": "kg", "m2": "kg", "k1": "N/m", "k2": "N/m", "c1": "N·s/m", "c2": "N·s/m"}
-_UNITS_PER_MASS = {
-    "m2": "",
-    "k1": "N/(m·kg)",
-    "k2": "N/(m·kg)",
-    "c1": "N·s/(m·kg)",
-    "c2": "N·s/(m·kg)",
-}
-_PROBE_ON = {False: "second mass, not the driven one (Eq. 7)", True: "driven mass (collocated)"}
-
-
-def two_mass_table(certificate: Certificate) -> Table:
-    """Return masses, springs and dampers, or each per mass of the table where that is not known."""
-    found, title = certificate.response.two_mass, "Two-mass model (Eq. 6, 7)"
-    if found is None:
-        return Table(title, (), [])
-    absolute = found.table_mass_kg is not None
-    rows = []
-    for name, unit in (_MECHANICAL_UNITS if absolute else _UNITS_PER_MASS).items():
-        value = found.model[name]
-        text = measured(value, found.relative_uncertainty.get(name, 0.0) * value, unit)
-        rows.append((name if absolute else f"{name} / m1", text + ", as given" * (name == "m1")))
-    rows += [
-        ("probe on the", _PROBE_ON[found.collocated]),
-        ("misfit, over the stated uncertainty", plain(found.misfit)),
-    ]
-    return Table(title if absolute else f"{title}, per mass of the table", (), rows)
-
-
-_SHAPE_ROWS = (
-    ("gain differs from 1 by 1 %", "bandwidth_1_percent", None),
-    ("gain differs from 1 by 3 dB", "bandwidth_3db", None),
-    ("highest peak of the gain", "resonance", "resonance_gain"),
-    ("lowest dip of the gain", "minimum", "minimum_gain"),
-)
-
-
-def shape_table(calibration: Calibration) -> Table:
-    """Return the salient points of the identified response, and whether the band reaches them."""
-    found, trusted = calibration.certificate.response, calibration.valid_up_to
-    rows = []
-    for name, place, gain in _SHAPE_ROWS:
-        at = found.shape.get(place)
-        if at is not None:
-            size = "" if gain is None else f"{plain(found.shape.get(gain), 4)} at "
-            rows.append((name, size + quantity(at, "Hz"), "yes" if at <= trusted else "no"))
-    if found.modal_remainder is not None:
-        remainder = percent(found.modal_remainder)
-        rows.append(("share of the greatest gain that Eq. 8 lacks", remainder, "yes"))
-    return Table("Shape of the response", ("", "within the valid range"), rows)
-
-
-def undetected_table(certificate: Certificate) -> Table:
-    """Return the model errors that this test could not detect, and what they cost on a scan."""
-    found = certificate.undetected
-    rows = []
-    for term in found.terms:
-        family, size = term.family, quantity(term.missed, "m")
-        if term.missed is not None and family in (CREEP, MODE):
-            size = f"{percent(term.missed)} of the motion"
-        if family == CREEP:
-            family += f" over {quantity(term.parameter, 's', 2)}"
-        elif family == MODE:
-            family += f" at {quantity(term.parameter, 'Hz', 2)}"
-        effects = (quantity(v, "m") for v in (term.missed_effect_on_scan_m, term.effect_on_scan_m))
-        rows.append((family, size, *effects))
-    further = (
-        ("dwell that would show the slowest creep", quantity(found.plateau_needed_s, "s")),
-        ("assumed: no relaxation slower than", quantity(found.slowest_creep_s, "s")),
-        ("assumed: no mode below", quantity(found.lowest_mode_hz, "Hz", 2)),
-    )
-    rows += [(name, value, "", "") for name, value in known_rows(further, 1)]
-    columns = ("largest undetected size", "its rms on the intended scan", "part of the band")
-    return Table("Undetected model errors", columns, rows)
-
+from omsm_ros.units import DEGREE_RAD, NANOSECONDS_PER_S, PPM
 
 BAND = "band"
 CAPTIONS = {
@@ -297,7 +189,7 @@ def _model_errors(certificate: Certificate) -> Section:
         (
             tables.model_error_table(certificate),
             tables.consistency_table(certificate),
-            undetected_table(certificate),
+            tables.undetected_table(certificate),
         ),
         "An effect larger than the largest undetected size would have been detected with a "
         "probability of 95 %. The band contains what the test cannot exclude. The rms is that of "
@@ -334,10 +226,10 @@ def sections(calibration: Calibration, issue: Issue) -> list[Section]:
             "Dynamics",
             (),
             (
-                mode_table(calibration),
-                two_mass_table(certificate),
+                tables.mode_table(calibration),
+                tables.two_mass_table(certificate),
                 tables.limit_table(certificate),
-                shape_table(calibration),
+                tables.shape_table(calibration),
                 tables.coefficient_table(calibration),
             ),
             "Uncertainties are standard, k = 1. Those of the coefficients are strongly "
@@ -465,3 +357,118 @@ def render_dcc(calibration: Calibration, version: str) -> str:
 def _word(value: str | None) -> str:
     """Return a text without spaces at its ends, which the schema forbids."""
     return " ".join((value or "").split()) or _UNSTATED
+
+
+_RECORD, _CORRELATION = "record", "correlation"
+_CAPTIONS_OF_MODEL = {
+    BAND: "Gain and phase with their 95 % band. Grey: not known within the limits.",
+    _RECORD: (
+        "The record, and what the model makes of its input alone; the state that it starts in "
+        "is fitted."
+    ),
+    _CORRELATION: "From sample to sample: outside the shade the residual is not white.",
+}
+_CLOSING_OF_MODEL = (
+    "The model is of deviations from the working point. The file has its coefficients and their "
+    "covariance."
+)
+
+
+def model_figures_of(
+    model: SampledModel, inputs: FloatArray, output: FloatArray, run: FreeRun
+) -> dict[str, bytes]:
+    """Return PNG files for the page."""
+    made = {
+        BAND: certificate_figures.response(model),
+        _RECORD: certificate_figures.record(model, inputs, output, run),
+        _CORRELATION: certificate_figures.correlation(run),
+    }
+    return {name: style.png(figure) for name, figure in made.items()}
+
+
+def render_model(model: SampledModel, run: FreeRun, issue: Issue) -> str:
+    """Return the page of a model and its ``run`` as HTML; all text from outside is escaped."""
+    return fill(
+        "certificate.html",
+        heading="Model",
+        issued=issue.line(),
+        closing=_CLOSING_OF_MODEL,
+        figures=issue.figures,
+        verdict=verdict_on_model(model),
+        headlines=_model_headlines(model, run),
+        sections=_model_sections(model, issue),
+        band=BAND,
+        picture=lambda name: picture(issue.figures[name]),
+        caption=_CAPTIONS_OF_MODEL.__getitem__,
+    )
+
+
+def verdict_on_model(model: SampledModel) -> PageVerdict:
+    """Return the model's own verdict, and why."""
+    stated = str(model.certificate.get("verdict", ""))
+    reasons, warnings = (tables.texts(model.certificate, name) for name in ("reasons", "warnings"))
+    if stated == REJECTED:
+        return PageVerdict("bad", "Rejected", tuple(reasons) or ("no reason is given",))
+    if not stated:
+        return PageVerdict("unknown", "Not judged", ("the model has no certificate",))
+    level = "care" if warnings else "good"
+    return PageVerdict(level, stated[:1].upper() + stated[1:], tuple(warnings))
+
+
+def _model_headlines(model: SampledModel, run: FreeRun) -> list[Headline]:
+    certificate = model.certificate
+    valid = "; ".join(" to ".join(quantity(end, "Hz") for end in ends) for ends in model.valid)
+    half = quantity(0.5 / model.sections.period, "Hz")
+    predicted = percent(certificate.get("predicted"), 4)
+    return [
+        Headline("Free run accounts for", percent(run.explained, 4), "of this record"),
+        Headline("Residual, rms", plain(run.rms, 4), "in the units of the output"),
+        Headline("Hidden parts accounted for", predicted, "when the model was identified"),
+        Headline("Valid", valid, f"half the sampling rate is {half}"),
+        Headline("Poles", str(certificate.get("order", NOTHING)), f"input: {model.sections.hold}"),
+    ]
+
+
+def _model_sections(model: SampledModel, issue: Issue) -> list[Section]:
+    certificate = model.certificate
+    tests = [
+        ("whiteness, p", probability(certificate.get("whiteness_p"))),
+        ("independence of the input, p", probability(certificate.get("independence_p"))),
+        ("residual when identified, rms", plain(certificate.get("residual_rms"))),
+        ("poles of the free choice", str(certificate.get("free_order", NOTHING))),
+        ("samples received", count(part(certificate, "samples", "received"))),
+        ("samples compared", count(part(certificate, "samples", "compared"))),
+    ]
+    stated = part(certificate, "limits")
+    limits = tables.limit_rows(stated if isinstance(stated, Mapping) else {})
+    judged_by = Table("Limits of the verdict", (), known_rows(limits, 1))
+    every = [
+        Section("Record", (_RECORD, _CORRELATION), (Table("", (), known_rows(tests, 1)),)),
+        Section("Poles", (), (_model_poles(certificate),)),
+        Section("Records", (), (_model_identity(model, issue), judged_by)),
+    ]
+    return present(every, issue.figures)
+
+
+def _model_poles(certificate: Mapping[str, Any]) -> Table:
+    rows = []
+    for pole in certificate.get("poles", ()):
+        if "frequency_hz" in pole:
+            rows.append((quantity(pole["frequency_hz"], "Hz"), plain(pole["damping"], 3)))
+        else:
+            word = "faster" if "faster_than_hz" in pole else "slower"
+            bound = quantity(pole[f"{word}_than_hz"], "Hz")
+            rows.append((f"not resolved ({word} than {bound})", NOTHING))
+    return Table("", ("damping ratio",), rows)
+
+
+def _model_identity(model: SampledModel, issue: Issue) -> Table:
+    rows = [
+        ("schema", SCHEMA),
+        ("record", issue.source or NOTHING),
+        ("sample period", quantity(model.sections.period, "s", 4)),
+        ("working point, inputs", ", ".join(plain(x, 6) for x in model.working_point[:-1])),
+        ("working point, output", plain(model.working_point[-1], 6)),
+        ("omsm_ros", issue.version or NOTHING),
+    ]
+    return Table("Identity", (), known_rows(rows, 1))

@@ -10,19 +10,22 @@ import numpy as np
 
 from omsm_ros.core.calibration.calibration import SCHEMA, Calibration
 from omsm_ros.core.calibration.certificate import Certificate
+from omsm_ros.core.lti.modes import KnownMode, known_modes
 from omsm_ros.core.lti.transfer_function import Structure
+from omsm_ros.core.model_errors.families import CREEP, MODE
 from omsm_ros.readable import (
     NOTHING,
     count,
     date_text_of_stamp,
     measured,
+    percent,
     plain,
     probability,
     quantity,
     superscript,
 )
 from omsm_ros.report.tables import Table, mapping_table
-from omsm_ros.units import PPM
+from omsm_ros.units import MILLISECOND_S, PPM
 
 # Where a p-value is called small.
 _SIGNIFICANT = 0.01
@@ -274,3 +277,111 @@ def further_table(certificate: Certificate) -> Table:
 def known_rows(rows: Iterable[tuple[str, ...]], column: int) -> Sequence[tuple[str, ...]]:
     """Return the rows that have something in ``column``."""
     return [row for row in rows if row[column] != NOTHING]
+
+
+def mode_table(calibration: Calibration) -> Table:
+    """Return the poles as terms of Eq. 8, and whether the band reaches them."""
+    modes = known_modes(calibration.dynamics, calibration.covariance)
+    rows = [
+        (
+            f"mode {index}" if mode.residue is not None else f"real pole {index}",
+            *_resolved(mode, calibration),
+            "yes" if mode.frequency <= calibration.valid_up_to else "no",
+        )
+        for index, mode in enumerate(modes, start=1)
+    ]
+    columns = ("frequency", "damping ratio", "residue [1/ms²]", "within the valid range")
+    return Table("Modes (Eq. 8)", columns, rows)
+
+
+def _resolved(mode: KnownMode, calibration: Calibration) -> tuple[str, str, str]:
+    """Return frequency, damping and residue; a pole beyond the sampling rate is not resolved."""
+    known, fastest = calibration.valid_up_to, 1 / calibration.sample_period
+    if mode.frequency > known and mode.frequency_uncertainty >= mode.frequency:
+        fastest = known
+    if mode.frequency > fastest:
+        return f"not resolved (faster than {quantity(fastest, 'Hz')})", "unknown", "unknown"
+    return (measured(mode.frequency, mode.frequency_uncertainty, "Hz"), *_oscillation(mode))
+
+
+def _oscillation(mode: KnownMode) -> tuple[str, str]:
+    if mode.residue is None or mode.residue_uncertainty is None:
+        return "1, by definition", "none"
+    residue, spread = (v * MILLISECOND_S**2 for v in (mode.residue, mode.residue_uncertainty))
+    return measured(mode.damping, mode.damping_uncertainty), measured(residue, spread)
+
+
+_MECHANICAL_UNITS = {"m1": "kg", "m2": "kg", "k1": "N/m", "k2": "N/m", "c1": "N·s/m", "c2": "N·s/m"}
+_UNITS_PER_MASS = {
+    "m2": "",
+    "k1": "N/(m·kg)",
+    "k2": "N/(m·kg)",
+    "c1": "N·s/(m·kg)",
+    "c2": "N·s/(m·kg)",
+}
+_PROBE_ON = {False: "second mass, not the driven one (Eq. 7)", True: "driven mass (collocated)"}
+
+
+def two_mass_table(certificate: Certificate) -> Table:
+    """Return masses, springs and dampers, or each per mass of the table where that is not known."""
+    found, title = certificate.response.two_mass, "Two-mass model (Eq. 6, 7)"
+    if found is None:
+        return Table(title, (), [])
+    absolute = found.table_mass_kg is not None
+    rows = []
+    for name, unit in (_MECHANICAL_UNITS if absolute else _UNITS_PER_MASS).items():
+        value = found.model[name]
+        text = measured(value, found.relative_uncertainty.get(name, 0.0) * value, unit)
+        rows.append((name if absolute else f"{name} / m1", text + ", as given" * (name == "m1")))
+    rows += [
+        ("probe on the", _PROBE_ON[found.collocated]),
+        ("misfit, over the stated uncertainty", plain(found.misfit)),
+    ]
+    return Table(title if absolute else f"{title}, per mass of the table", (), rows)
+
+
+_SHAPE_ROWS = (
+    ("gain differs from 1 by 1 %", "bandwidth_1_percent", None),
+    ("gain differs from 1 by 3 dB", "bandwidth_3db", None),
+    ("highest peak of the gain", "resonance", "resonance_gain"),
+    ("lowest dip of the gain", "minimum", "minimum_gain"),
+)
+
+
+def shape_table(calibration: Calibration) -> Table:
+    """Return the salient points of the identified response, and whether the band reaches them."""
+    found, trusted = calibration.certificate.response, calibration.valid_up_to
+    rows = []
+    for name, place, gain in _SHAPE_ROWS:
+        at = found.shape.get(place)
+        if at is not None:
+            size = "" if gain is None else f"{plain(found.shape.get(gain), 4)} at "
+            rows.append((name, size + quantity(at, "Hz"), "yes" if at <= trusted else "no"))
+    if found.modal_remainder is not None:
+        remainder = percent(found.modal_remainder)
+        rows.append(("share of the greatest gain that Eq. 8 lacks", remainder, "yes"))
+    return Table("Shape of the response", ("", "within the valid range"), rows)
+
+
+def undetected_table(certificate: Certificate) -> Table:
+    """Return the model errors that this test could not detect, and what they cost on a scan."""
+    found = certificate.undetected
+    rows = []
+    for term in found.terms:
+        family, size = term.family, quantity(term.missed, "m")
+        if term.missed is not None and family in (CREEP, MODE):
+            size = f"{percent(term.missed)} of the motion"
+        if family == CREEP:
+            family += f" over {quantity(term.parameter, 's', 2)}"
+        elif family == MODE:
+            family += f" at {quantity(term.parameter, 'Hz', 2)}"
+        effects = (quantity(v, "m") for v in (term.missed_effect_on_scan_m, term.effect_on_scan_m))
+        rows.append((family, size, *effects))
+    further = (
+        ("dwell that would show the slowest creep", quantity(found.plateau_needed_s, "s")),
+        ("assumed: no relaxation slower than", quantity(found.slowest_creep_s, "s")),
+        ("assumed: no mode below", quantity(found.lowest_mode_hz, "Hz", 2)),
+    )
+    rows += [(name, value, "", "") for name, value in known_rows(further, 1)]
+    columns = ("largest undetected size", "its rms on the intended scan", "part of the band")
+    return Table("Undetected model errors", columns, rows)

@@ -99,7 +99,6 @@ class CloudView:
     time: since the start of the scan [s]
     x, y: position in the workpiece frame [m]
     height: corrected [m] (Eq. 10)
-    raw_height: encoder plus probe as read, uncorrected [m] (Eq. 2)
     dynamic_error: (1 - G_m) X_d [m] (Eq. 5), removed by the correction
     uncertainty: standard uncertainty of height [m], k = 1
     """
@@ -108,7 +107,6 @@ class CloudView:
     x: FloatArray
     y: FloatArray
     height: FloatArray
-    raw_height: FloatArray
     dynamic_error: FloatArray
     uncertainty: FloatArray
 

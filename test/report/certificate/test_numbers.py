@@ -10,13 +10,13 @@ import pytest
 from certified import certified_by
 
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.report.certificate.page import (
+from omsm_ros.report.certificate.tables import (
     mode_table,
+    order_table,
     shape_table,
     two_mass_table,
     undetected_table,
 )
-from omsm_ros.report.certificate.tables import order_table
 
 from .certificates import by_name, certified
 

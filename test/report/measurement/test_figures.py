@@ -23,7 +23,10 @@ def deviations(cloud):
             form.deviation(cloud.x, cloud.y, height, PAPER_MIRROR),
             weights=weights,
         )
-        for name, height in (("raw", cloud.raw_height), ("corrected", cloud.height))
+        for name, height in (
+            ("raw", cloud.height + cloud.dynamic_error),
+            ("corrected", cloud.height),
+        )
     }
 
 
