@@ -34,7 +34,7 @@ from omsm_ros.pipelines.progress import state_progress
 from omsm_ros.quantities import shown
 from omsm_ros.units import DATE
 
-_ARRAYS = (".npy", ".npz", ".mat", ".h5", ".hdf5")
+_ARRAYS, _TDMS = (".npy", ".npz", ".mat", ".h5", ".hdf5"), ".tdms"
 _BAGS = (".mcap", ".bag", ".db3")
 
 
@@ -338,21 +338,17 @@ def open_tables(path: Path, form: TableForm, wanted: Sequence[str]) -> list[Fore
 
 def _table(path: Path, suffix: str, form: TableForm) -> ForeignTable:
     # Imported when needed: some are optional packages, and all take time to load.
-    if suffix in _ARRAYS:
-        from omsm_ros.io.tables.array_table import ArrayTable
+    if suffix in (*_ARRAYS, _TDMS):
+        from omsm_ros.io.tables.binary_table import ArrayTable, TdmsTable
 
-        return ArrayTable(path)
-    if suffix == ".tdms":
-        from omsm_ros.io.tables.array_table import TdmsTable
-
-        return TdmsTable(path)
+        return TdmsTable(path) if suffix == _TDMS else ArrayTable(path)
     from omsm_ros.io.tables.text_table import TextTable
 
     return TextTable(path, form)
 
 
 def _topics(path: Path, wanted: Sequence[str]) -> list[ForeignTable]:
-    from omsm_ros.io.tables.topic_table import ForeignBag
+    from omsm_ros.io.tables.binary_table import ForeignBag
 
     bag = ForeignBag(path)
     topics = bag.topics()

@@ -8,7 +8,7 @@ import pytest
 from scipy.io import savemat
 
 from omsm_ros.errors import FileError
-from omsm_ros.io.tables.array_table import ArrayTable
+from omsm_ros.io.tables.binary_table import ArrayTable
 
 Z = np.sin(np.arange(5000) / 7)
 

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from omsm_ros.errors import BagError
 from omsm_ros.io import bag_checks, bags, message_mapping
 from omsm_ros.io.bag_writer import BagWriter
-from omsm_ros.io.tables.topic_table import ForeignBag
+from omsm_ros.io.tables.binary_table import ForeignBag
 
 AXES = bags.TOPIC_TYPES[bags.AXES_TOPIC]
 

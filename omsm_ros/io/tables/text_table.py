@@ -7,6 +7,7 @@ import csv
 import io
 import re
 import warnings
+from bisect import bisect_left
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -228,15 +229,14 @@ class TextTable(ForeignTable):
                     )
 
     def _culprit(self, lines: list[tuple[int, str]], rows: _Rows) -> FileError:
-        good, bad = 0, len(lines)  # lines[:good] are rows, lines[:bad] are not all
-        while bad - good > 1:
-            middle = (good + bad) // 2
+        def unreadable(last: int) -> bool:
             try:
-                rows.read([line for _, line in lines[good:middle]])
-                good = middle
+                rows.read([line for _, line in lines[: last + 1]])
             except ValueError:
-                bad = middle
-        number, line = lines[good]
+                return True
+            return False
+
+        number, line = lines[bisect_left(range(len(lines)), True, key=unreadable)]
         return FileError(
             f"{self}, line {number}: {shown(line.strip())} is no row of numbers; "
             f"{self._remedy(number, line, rows)}"
