@@ -14,6 +14,12 @@ import numpy as np
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.calibration_set import CalibrationSet
+from omsm_ros.core.correction.machine_sources import (
+    NOTHING_STATED,
+    OF_CALIBRATION,
+    POINT_SOURCES,
+    whole_scan_sources,
+)
 from omsm_ros.core.correction.motion_filter import (
     MOVED,
     RATE,
@@ -25,12 +31,7 @@ from omsm_ros.core.correction.motion_filter import (
 from omsm_ros.core.correction.source_kinds import SystematicSource
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.systematic import MOST_TRACED, ScanPoints, ScanTrace
-from omsm_ros.core.correction.uncertainty import (
-    SCAN_SCATTER,
-    ErrorSources,
-    contributions,
-    reading_variances,
-)
+from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources, reading_variances
 from omsm_ros.core.kinematics.kinematics import Geometry, PitchCurve, Surface, workpiece_points
 from omsm_ros.core.streams.blocks import (
     SAME_PERIOD,
@@ -115,12 +116,13 @@ class Corrector:
         self._axes, self._distance = StreamInput(), StreamInput(options.trigger.counter_offset)
         self._pairing = Pairing(self._axes, self._distance, options.trigger)
         self._motion: MotionFilter | None = None
-        self._noise_gain = 1.0
-        self._variance: defaultdict[str, float] = defaultdict(float)
+        names = (*OF_CALIBRATION, *POINT_SOURCES, SCAN_SCATTER)
+        self._variance = defaultdict(float, dict.fromkeys(names, 0.0))
         self._ready: list[SurfacePoints] = []
+        own = whole_scan_sources(calibration, self._sources, options.geometry, NOTHING_STATED)
         self._systematic = [
             source
-            for source in options.systematic
+            for source in (*own, *options.systematic)
             if options.surface is not None or not source.kind.needs_slope
         ]
         self.trace = ScanTrace(most_traced)
@@ -233,9 +235,10 @@ class Corrector:
         lag = latency_in_use(known, self._options)
         members = known.members if isinstance(known, CalibrationSet) else (known,)
         filters = [MotionFilters.of(member, period, lag) for member in members]
-        self._noise_gain = max(each.height.noise_gain for each in filters)
-        stated = reading_variances(self._sources, self._noise_gain, self._static_gain)
-        self._scatter = RunningScatter(float(np.sqrt(sum(stated.values()))))
+        noise_gain = max(each.height.noise_gain for each in filters)
+        self._random = reading_variances(self._sources, noise_gain, self._static_gain)
+        self._scatter = RunningScatter(float(np.sqrt(sum(self._random.values()))))
+        self._random["discretisation"] = self._sources.discretisation**2
         self.trace.undetected = undetected_rows(filters)
         blend = Blend(known) if isinstance(known, CalibrationSet) else None
         return MotionFilter(*filters, blend=blend)
@@ -271,34 +274,21 @@ class Corrector:
             height=where.height,
             dynamic_error=dynamic_error,
             uncertainty=self._uncertainty(
-                reading, points, self._scatter.excess(axes.session, sample, where.height)
+                points, self._scatter.excess(axes.session, sample, where.height)
             ),
             intensity=intensity.astype(np.float32),
             stamp_ns=round(axes.stamp_of(int(sample[0]))) if len(sample) else 0,
         )
 
-    def _uncertainty(
-        self, reading: FloatArray, points: ScanPoints, excess: FloatArray
-    ) -> FloatArray:
-        squares = points.dynamics**2
-        variances = contributions(
-            self._sources,
-            self._noise_gain,
-            self._static_gain,
-            reading,
-            np.sum(squares[~points.undetected], axis=0),
-            np.sum(squares[points.undetected], axis=0),
-            points.z_rate,
-            self._options.geometry.abbe_arm,
-        )
-        variances[SCAN_SCATTER] = excess
-        if self._systematic and self._options.surface is not None:
+    def _uncertainty(self, points: ScanPoints, excess: FloatArray) -> FloatArray:
+        variances: dict[str, FloatArray | float] = {**self._random, SCAN_SCATTER: excess}
+        if any(source.kind.needs_slope for source in self._systematic):
             points = points.with_slopes(self._options.surface)
         for source in self._systematic:
             variances[source.name] = variances.get(source.name, 0.0) + source.variance(points)
         for name, variance in variances.items():
             common = isinstance(variance, float)
-            self._variance[name] += float(np.sum(variance)) * (len(reading) if common else 1)
+            self._variance[name] += float(np.sum(variance)) * (len(points) if common else 1)
         return np.sqrt(sum(variances.values()))
 
 

@@ -182,7 +182,8 @@ def whole_scan_sources(
     reason: str | Notice
     members = calibration.members if isinstance(calibration, CalibrationSet) else (calibration,)
     for name, part in zip(OF_CALIBRATION, (0, 1), strict=True):
-        if any(covariance_parts(member)[part].covariance.any() for member in members):
+        between = len(members) > 1 and part == 0  # members of a set differ in their response
+        if between or any(covariance_parts(member)[part].covariance.any() for member in members):
             reason = Notice("correction.from_covariance")
             found.append(SystematicSource(name, 1.0, EVALUATED, reason))
     parameters: dict[str, Mapping[str, float]] = {

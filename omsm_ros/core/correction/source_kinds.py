@@ -221,7 +221,9 @@ KINDS: dict[str, SourceKind] = {
     "probe_latency": SourceKind(_SECONDS, lambda p, _: p.z_rate),
     "lag_change": SourceKind(_SECONDS, lambda p, _: p.z_rate),
     # The direction in which Z moves.
-    "motion_error": SourceKind(_METRES, lambda p, _: np.sign(p.z_rate)),
+    "motion_error": SourceKind(
+        _METRES, lambda p, _: np.sign(p.z_rate), squares=lambda p, _: np.ones(len(p))
+    ),
     # Tilts of the part about y and about x; the lateral shift of the points is negligible.
     "tilt": SourceKind(_RADIANS, lambda p, _: np.stack([-p.x, p.y])),
     "decentre": SourceKind(_METRES, lambda p, _: _along_both(p), needs_slope=True),

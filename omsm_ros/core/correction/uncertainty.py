@@ -78,37 +78,6 @@ class ErrorSources(CheckedRecord):
         )
 
 
-def contributions(
-    sources: ErrorSources,
-    noise_gain: float,
-    static_gain: float,
-    distance: FloatArray,
-    dynamics: FloatArray,
-    undetected: FloatArray,
-    z_rate: FloatArray,
-    abbe_arm: float = 0.0,
-) -> dict[str, FloatArray | float]:
-    """Return variances of the heights [m²] by their source, each (n,) or one for all points.
-
-    noise_gain: of H for white noise;  distance: readings [m], (n,)
-    dynamics, undetected: variance of H(z) [m²] from the noise of the step test and from undetected
-        model error, (n,);  z_rate: of H(z) [m/s], (n,)
-    abbe_arm: from the Z encoder's line to the beam [m]
-    """
-    scale = sources.static_gain / static_gain**2
-    scatter: dict[str, FloatArray | float] = {**reading_variances(sources, noise_gain, static_gain)}
-    return {
-        "dynamics": dynamics,
-        "undetected_model_error": undetected,
-        "probe_latency": (sources.probe_latency * z_rate) ** 2,
-        "static_gain": (scale * distance) ** 2,
-        **scatter,
-        "motion_error": sources.motion_error**2,
-        "discretisation": sources.discretisation**2,
-        "pitch": (abbe_arm * sources.pitch) ** 2,
-    }
-
-
 def reading_variances(
     sources: ErrorSources, noise_gain: float, static_gain: float
 ) -> dict[str, float]:

@@ -178,12 +178,8 @@ class DigitalFilter:
 
     def response(self, frequency: FloatArray) -> ComplexArray:
         """Return H at ``frequency`` [Hz], of the same shape."""
-        backward = np.exp(-2j * np.pi * np.asarray(frequency) * self.sample_period)
-        result = np.ones_like(backward)
-        for section in self.sections:
-            result = result * polynomial.polyval(backward, section[:3])
-            result = result / polynomial.polyval(backward, section[3:])
-        return np.asarray(result, np.complex128)
+        angle = 2 * np.pi * np.asarray(frequency) * self.sample_period
+        return np.asarray(scipy.signal.freqz_sos(self.sections, angle)[1], np.complex128)
 
     @cached_property
     def poles(self) -> ComplexArray:

@@ -6,9 +6,9 @@ polynomial.
 """
 
 from functools import cache
-from math import comb
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.lti.discretisation import DigitalFilter
 from omsm_ros.core.streams.blocks import FloatArray
@@ -32,14 +32,9 @@ def past_motion(first: FloatArray) -> FloatArray:
     start = first[0]
     # A sum of products instead of a BLAS call, because its order of additions is fixed.
     centred = (weights * (first - start)).sum(axis=1)
-    shifted = np.array(
-        [
-            sum(centred[j] * comb(j, k) * (-middle) ** (j - k) for j in range(k, len(centred)))
-            for k in range(len(centred))
-        ]
-    )
-    shifted[0] += start
-    return shifted
+    place, rate, bend = centred
+    place = place - middle * rate + middle**2 * bend
+    return np.array([start + place, rate - 2 * middle * bend, bend])
 
 
 def past_stationary(first: FloatArray) -> FloatArray:
@@ -100,10 +95,5 @@ def _polynomial_response(section: FloatArray, motion: FloatArray) -> FloatArray:
 def _shifts(degree: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the matrices (degree, degree) that delay a polynomial by 0, 1 and 2 samples."""
     # q(k) -> q(k - 1) is a triangular matrix acting on the coefficients of q.
-    shift = np.array(
-        [
-            [comb(j, i) * (-1.0) ** (j - i) if j >= i else 0.0 for j in range(degree)]
-            for i in range(degree)
-        ]
-    )
+    shift = np.asarray(scipy.linalg.invpascal(degree, "upper"), np.float64)
     return np.eye(degree), shift, shift @ shift

@@ -12,13 +12,16 @@ from scipy import signal
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correction.machine_sources import NOTHING_STATED, whole_scan_sources
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
+from omsm_ros.core.correction.systematic import ScanPoints
 from omsm_ros.core.correction.uncertainty import (
     ErrorSources,
-    contributions,
+    reading_variances,
     sensitivity_filters,
     with_lateral_uncertainty,
 )
+from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.lti.discretisation import discretise
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
@@ -201,38 +204,37 @@ def test_a_known_response_needs_no_filters() -> None:
     assert sensitivity_filters(calibration(np.zeros((7, 7))), PERIOD) == []
 
 
-def test_contributions_by_hand() -> None:
+def test_variances_of_readings_by_hand() -> None:
     sources = ErrorSources(
         probe_noise=2.0,
         probe_resolution=np.sqrt(12.0),
         encoder_noise=3.0,
         encoder_resolution=np.sqrt(12.0),
-        static_gain=0.1,
-        discretisation=5.0,
-        pitch=2e-6,
-        probe_latency=1e-3,
+        vibration=5.0,
     )
-    found = contributions(
-        sources,
-        2.0,
-        0.5,
-        np.array([0.0, 4.0]),
-        np.array([7.0, 8.0]),
-        np.array([5.0, 6.0]),
-        np.array([9.0, 10.0]),
-        abbe_arm=0.1,
+    found = reading_variances(sources, 2.0, 0.5)
+    expected = (16.0, 4.0, 36.0, 4.0, 25.0)
+    assert list(found.values()) == pytest.approx(expected)
+
+
+def test_variances_of_the_whole_scan_by_hand() -> None:
+    sources = ErrorSources(
+        static_gain=0.1, discretisation=5.0, pitch=2e-6, probe_latency=1e-3, motion_error=3.0
     )
-    assert found["probe_noise"] == pytest.approx(16.0)
-    assert found["probe_resolution"] == pytest.approx(4.0)
-    assert found["encoder_noise"] == pytest.approx(36.0)
-    assert found["encoder_resolution"] == pytest.approx(4.0)
-    assert found["static_gain"] == pytest.approx([0.0, 1.6**2])
-    assert found["discretisation"] == 25.0
+    one, known = np.ones(2), calibration(np.zeros((7, 7)))
+    points = ScanPoints(
+        time=one, x=one, y=one, height=one, z=one, z_rate=np.array([0.0, 10.0]), b=one, c=one,
+        distance=np.array([0.0, 4.0]),
+    )  # fmt: skip
+    acting = whole_scan_sources(known, sources, Geometry(abbe_arm=0.1), NOTHING_STATED)
+    found = {source.name: source.variance(points) for source in acting}
+    assert found["static_gain"] == pytest.approx([0.0, (0.4 / GAIN) ** 2])
     # A tenth of a metre off, a pitch of 2 µrad is 200 nm.
     assert found["pitch"] == pytest.approx((200e-9) ** 2, rel=1e-6, abs=0)
-    assert found["dynamics"] == pytest.approx([7.0, 8.0])
-    assert found["undetected_model_error"] == pytest.approx([5.0, 6.0])
-    assert found["probe_latency"] == pytest.approx([81e-6, 100e-6])
+    assert found["probe_latency"] == pytest.approx([0.0, 1e-4])
+    # Backlash counts where the axis stands, too.
+    assert found["motion_error"] == pytest.approx([9.0, 9.0])
+    assert set(found) == {"static_gain", "pitch", "probe_latency", "motion_error"}
 
 
 def test_probe_latency_adds_its_uncertainty_times_the_speed() -> None:
