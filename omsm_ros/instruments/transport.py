@@ -23,7 +23,9 @@ from omsm_ros.errors import ConfigurationError, DeviceError, DeviceTimeoutError
 def parts_of(address: str) -> SplitResult:
     """Return the parts of an address such as ``daq://Dev1/ai0?range=10``; ConfigurationError."""
     try:
-        return urlsplit(address)
+        parts = urlsplit(address)
+        _ = parts.port  # raises as well
+        return parts
     except ValueError as err:
         raise ConfigurationError(f"address {address!r} cannot be read: {err}") from err
 

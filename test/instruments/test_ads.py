@@ -3,7 +3,7 @@
 import socket
 import struct
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 import numpy as np
 import pytest
@@ -164,6 +164,19 @@ def test_a_symbol_that_is_not_there_is_reported(plc):
     with pytest.raises(DeviceError, match=r"GVL\.other"):
         ring.open()
     assert time.monotonic() - begin < 1.7
+
+
+def test_a_plc_that_is_switched_off_is_given_up_after_a_second():
+    # A host that does not answer at all: the queue of connections that it accepts is full.
+    with socket.create_server(("127.0.0.77", 48898), backlog=0), ExitStack() as others:
+        for _ in range(3):
+            other = others.enter_context(socket.socket())
+            other.setblocking(False)
+            other.connect_ex(("127.0.0.77", 48898))
+        begin = time.monotonic()
+        with pytest.raises(DeviceError, match="does not answer: timed out"):
+            AdsRing("ads://127.0.0.77").open()
+        assert time.monotonic() - begin < 1.7
 
 
 def test_no_plc_is_one_clear_line():

@@ -1,6 +1,7 @@
 """Reads the generic six-channel stream, binary or text, from a line or a TwinCAT PLC."""
 
 import ctypes
+import socket
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -192,8 +193,9 @@ def make_text(values: Values, transport: Transport, now_ns: NowNs, **more: Any) 
 _WRITTEN_SIZE = 8
 # At 1 kHz this gives twenty samples at a time, and a ring of a thousand holds a second [s].
 _POLL_S = 0.02
-# An answer that takes longer than this counts as lost, so that the driver connects again [ms].
-_ANSWER_MS = 1000
+# An answer that takes longer than this counts as lost, so that the driver connects again [s].
+_ANSWER_S = 1.0
+_ROUTER_PORT = 48898
 _MOST_SAMPLES = 200_000
 
 
@@ -220,10 +222,7 @@ class AdsRing:
         self.name = address
         self._host = parts.hostname
         self._net_id = parts.path.strip("/") or f"{self._host}.1.1"
-        try:
-            self._port = parts.port or 851
-        except ValueError as err:
-            raise ConfigurationError(f"address {address!r}: {err}") from err
+        self._port = parts.port or 851
         self._symbol = query["symbol"][0]
         self._capacity = int(samples)
         self._size = _WRITTEN_SIZE + self._capacity * BODY_SIZE
@@ -235,19 +234,19 @@ class AdsRing:
         self.close()
         pyads = _pyads()
         try:
+            # pyads itself would wait for two minutes for a host that is switched off.
+            socket.create_connection((self._host, _ROUTER_PORT), _ANSWER_S).close()
             self._plc = pyads.Connection(self._net_id, self._port, self._host)
             self._plc.open()
-            self._plc.set_timeout(_ANSWER_MS)
-            written, _ = self._snapshot()
-            self._taken = written if self._taken < 0 else self._taken
         except (pyads.ADSError, OSError, ValueError, TypeError) as err:
             self.close()
-            if isinstance(err, DeviceError):
-                raise
             raise DeviceError(
                 f"{self.name} does not answer: {err}; check address, net id, and the PLC's route "
                 "to this computer"
             ) from err
+        self._plc.set_timeout(round(_ANSWER_S * 1000))
+        written, _ = self._snapshot()
+        self._taken = written if self._taken < 0 else self._taken
 
     def read(self, timeout: float) -> bytes:
         """Return new samples as frames of the six-channel stream, b"" if none came in time."""
