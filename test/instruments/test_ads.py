@@ -1,5 +1,6 @@
 """The ring buffer of a PLC, played by pyads' own server: every sample once, gaps counted."""
 
+import ctypes
 import socket
 import struct
 import time
@@ -150,9 +151,19 @@ def test_a_plc_that_counts_anew_goes_on(plc, device):
     assert device.statistics.restarts == 1
 
 
-def test_a_ring_of_another_size_is_reported(plc):
-    ring = AdsRing("ads://127.0.0.1?samples=60")
-    with pytest.raises(DeviceError, match="packed to one byte"):
+@pytest.mark.parametrize(("samples", "reported"), [(60, "packed to one byte"), (40, "has more")])
+def test_a_ring_of_another_size_is_reported(plc, monkeypatch, samples, reported):
+    # Half of the samples would be repeated or lost, if the first part of a larger ring were read.
+    import pyads
+
+    def as_twincat_reads(connection, name, kind, **more):
+        if ctypes.sizeof(kind) > len(plc.image()):
+            raise pyads.ADSError(0x705)
+        return kind.from_buffer_copy(plc.image())
+
+    monkeypatch.setattr(pyads.Connection, "read_by_name", as_twincat_reads)
+    ring = AdsRing(f"ads://127.0.0.1?samples={samples}")
+    with pytest.raises(DeviceError, match=reported):
         ring.open()
 
 

@@ -54,8 +54,8 @@ class SampleRun:
         cls, block: Block, arrival: Arrival, reasons: NDArray[np.uint8], values: FloatArray
     ) -> SampleRun:
         """Return the new samples of ``block``, all of which have ``reasons`` and ``values``."""
-        period_ns = _period_ns(block)
-        whole = cls(arrival.session, arrival.first, block.stamp_ns, period_ns, reasons, values)
+        begin = arrival.session, arrival.first, block.stamp_ns, _period_ns(block)
+        whole = cls(*begin, reasons, values)
         return whole.part(arrival.skip, len(whole)) if arrival.skip else whole
 
     def __len__(self) -> int:
@@ -290,10 +290,10 @@ class Pairing:
                     return -1
                 if d.session == self._link[1]:
                     return 1
-                return _sign(a.stamp_ns - d.stamp_ns) or -1
+                return -1 if a.stamp_ns <= d.stamp_ns else 1
             if max(a.first, d.first) < min(a.end, d.end):
                 self._link = (a.session, d.session)
-        return _sign(a.first - d.first)
+        return (a.first > d.first) - (a.first < d.first)
 
 
 def _apart(a: SampleRun, d: SampleRun) -> bool:
@@ -309,7 +309,3 @@ def _missing(run: SampleRun, other: RunQueue) -> RejectionReason:
 
 def _period_ns(block: Block) -> float:
     return block.sample_period * NANOSECONDS_PER_S
-
-
-def _sign(value: float) -> int:
-    return (value > 0) - (value < 0)

@@ -195,7 +195,6 @@ _WRITTEN_SIZE = 8
 _POLL_S = 0.02
 # An answer that takes longer than this counts as lost, so that the driver connects again [s].
 _ANSWER_S = 1.0
-_ROUTER_PORT = 48898
 _MOST_SAMPLES = 200_000
 
 
@@ -235,7 +234,7 @@ class AdsRing:
         pyads = _pyads()
         try:
             # pyads itself would wait for two minutes for a host that is switched off.
-            socket.create_connection((self._host, _ROUTER_PORT), _ANSWER_S).close()
+            socket.create_connection((self._host, 48898), _ANSWER_S).close()
             self._plc = pyads.Connection(self._net_id, self._port, self._host)
             self._plc.open()
         except (pyads.ADSError, OSError, ValueError, TypeError) as err:
@@ -247,6 +246,9 @@ class AdsRing:
         self._plc.set_timeout(round(_ANSWER_S * 1000))
         written, _ = self._snapshot()
         self._taken = written if self._taken < 0 else self._taken
+        with suppress(pyads.ADSError, RuntimeError):  # refused if there is no byte more
+            self._plc.read_by_name(self._symbol, ctypes.c_ubyte * (self._size + 1))
+            raise DeviceError(f"{self.name}: the ring has more samples than that; state how many")
 
     def read(self, timeout: float) -> bytes:
         """Return new samples as frames of the six-channel stream, b"" if none came in time."""
