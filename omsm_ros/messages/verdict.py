@@ -113,6 +113,7 @@ SOURCE_NAMES = {
     "scan_differs": "form that one scan alone shows",
     "height_step": "step of the height",
     "c_lost": "lost counts of C",
+    "sense_of_c": "sense of C (if wrong, the map is mirrored; a part turned on the chuck shows it)",
 }
 
 

@@ -203,7 +203,7 @@ def adjust(
         _or_sense_of_c(reasons, scans, priors, surface, refutations),
         not_evaluated(families, effects, priors, open_limit(accuracy))
         + looks_like(form.resembled, families, accepted, open_limit(accuracy)),
-        rests_on(families, effects, form.mean_uncertainty),
+        rests_on(families, effects, form.mean_uncertainty, _mirrored(scans, surface, form)),
         enough, 2 * form.pv.uncertainty, accuracy,
         None if enough else best_addition(scans[0], priors, surface, removed),
         calibration,
@@ -279,6 +279,12 @@ def _or_sense_of_c(
     network, sizes = _network(mirrored, views, priors)
     agrees = all(r.minor for r in _fitted(network, views, sizes, priors)[1])
     return (Reason(WRONG_SENSE),) if agrees else reasons
+
+
+def _mirrored(scans: Sequence[ScanData], surface: Surface, form: FormMap) -> bool:
+    """Return whether the nominal surface is its own mirror image, and no scan shows the part's."""
+    change = surface.height(form.x, form.y) - surface.height(form.x, -form.y)
+    return len({s.clocking for s in scans}) == 1 and float(np.ptp(change)) < form.pv.value
 
 
 def _findings(

@@ -8,7 +8,7 @@ that are evenly spread. What is faster than a sector is noise of the readings.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -58,10 +58,6 @@ class Blocks:
     def scans(self) -> int:
         """Number of scans."""
         return len(self.noise)
-
-    def with_columns(self, columns: FloatArray) -> Blocks:
-        """Return the blocks with further columns (b, k)."""
-        return replace(self, columns=np.concatenate([self.columns, columns], axis=1))
 
     def only(self, mine: BoolArray) -> Blocks:
         """Return the blocks ``mine`` without columns, their scans numbered from 0."""

@@ -48,7 +48,7 @@ class Scales:
     @property
     def texture(self) -> float:
         """Standard deviation of the part by cells and rings, which no smooth term describes [m]."""
-        return float(np.sqrt(self.cells + self.bands.get(RINGS, 0.0)))
+        return float(np.sqrt(self.cells + sum(s for d, s in self.bands.items() if d <= RINGS)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,8 @@ class Network:
 
     def with_families(self, extra: Sequence[Family], columns: FloatArray) -> Network:
         """Return the network with further families, whose block means are ``columns`` (b, k)."""
-        blocks, families = self.blocks.with_columns(columns), (*self.families, *extra)
+        every = np.concatenate([self.blocks.columns, columns], axis=1)
+        blocks, families = replace(self.blocks, columns=every), (*self.families, *extra)
         return Network(blocks, families, self.part, _values=self._values)
 
     def _own(self, scan: int) -> list[tuple[slice, slice]]:

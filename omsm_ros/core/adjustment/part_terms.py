@@ -2,10 +2,10 @@
 
 Terms are regular at the axis, which errors of the machine need not be: one scan separates them by
 that, except where they are rotationally symmetric. A turned part may have any profile over the
-radius, a cone at the centre too: the cone is free, and rings are hat functions of one variance,
-estimated from the scans. Without them a ring would pass for an error of the spindle centre, a
-drift or a bend of a slide. Cells are random effects of one variance, common to all scans,
-eliminated cell by cell.
+radius, a cone at the centre too: the cone is free, and rings are waves over the radius, with one
+variance for each octave, estimated from the scans. Without them a ring would pass for an error of
+the spindle centre, a drift or a bend of a slide. Cells are random effects of one variance, common
+to all scans, eliminated cell by cell.
 """
 
 from dataclasses import dataclass, replace
@@ -21,15 +21,13 @@ from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zerni
 # Above degree 6 the variance of each degree is estimated: free terms would take what an error of
 # the spindle centre has beyond the regular ones (tried: to degree 10 they raise U by a half).
 FREE_DEGREE, HIGHEST_DEGREE = 6, 24
-# Stands for a degree among the variances that are estimated.
-RINGS = -1
-# Stands for the degrees of rotationally symmetric terms above the free ones: turning leaves them,
-# and their variance says nothing of the others.
-SYMMETRIC = -2
+# Among the variances that are estimated: rotationally symmetric terms above the free ones, for
+# turning leaves them, and the first octave of the rings.
+SYMMETRIC, RINGS = -1, -2
 # A tool that misses the centre turns a cone: power of the radius, not a degree of a term.
 _CONE = 1
-# Knots over the radius, a turn apart at least.
-_MOST_KNOTS, _TURNS_A_KNOT = 64, 1
+# Half waves of the rings over the radius: what has a whole one in a turn looks like a centre.
+_MOST_WAVES, _WAVES_A_TURN = 128, 1.5
 # A form that large is no form error of a finished part: no prior at all.
 FREE_M = 1e-5
 # Of the radius: a spiral about the axis begins and ends within a pitch of where it should.
@@ -43,7 +41,7 @@ class PartModel:
     """Terms and cells of the part.
 
     disc: that the terms are defined on;  terms: from degree 0
-    inner, outer: radii about the spindle between which rings are [m];  ring_knots: their number
+    inner, outer: radii about the spindle between which rings are [m];  waves: half waves of each
     rings: of the cells;  cell: of each block (b,);  cells: their number
     """
 
@@ -54,7 +52,7 @@ class PartModel:
     cells: int
     inner: float
     outer: float
-    ring_knots: int
+    waves: IntArray
 
     def values(self, x: FloatArray, y: FloatArray, span: FloatArray | None = None) -> FloatArray:
         """Return terms, cone and rings at x, y [m], (n, k), terms averaged over arcs ``span``
@@ -64,35 +62,31 @@ class PartModel:
             order = np.array([abs(t.m) for t in self.terms])
             for m in np.unique(order):
                 made[:, order == m] *= np.sinc(span * m / (2 * np.pi))[:, np.newaxis]
-        radius = np.hypot(x, y)
-        cone = (radius / self.outer)[:, np.newaxis]
-        return np.concatenate([made, cone, self._hats(radius)], axis=1)
+        radius = np.hypot(x, y)[:, np.newaxis]
+        return np.concatenate([made, radius / self.outer, self._rings(radius)], axis=1)
 
-    def _hats(self, radius: FloatArray) -> FloatArray:
-        """Return hat functions of the radius about the spindle [m], (n, ring_knots)."""
-        made = np.zeros((len(radius), self.ring_knots))
-        place = np.clip(
-            (radius - self.inner) / (self.outer - self.inner) * (self.ring_knots - 1),
-            0.0,
-            self.ring_knots - 1 - 1e-9,
-        )
-        left = place.astype(np.int64)
-        row = np.arange(len(radius))
-        made[row, left], made[row, left + 1] = 1 - (place - left), place - left
-        return made
+    @property
+    def _octave(self) -> IntArray:
+        """Octave of each ring, (w,)."""
+        return np.asarray(np.log2(self.waves), np.int64)
+
+    def _rings(self, radius: FloatArray) -> FloatArray:
+        """Return rings at a radius (n, 1) [m], (n, w); an octave has mean square one."""
+        place = np.clip((radius - self.inner) / (self.outer - self.inner), 0.0, 1.0)
+        number = np.bincount(self._octave, minlength=1)[self._octave]
+        return np.asarray(np.cos(np.pi * place * self.waves) * np.sqrt(2 / number))
 
     @property
     def free(self) -> FloatArray:
         """Standard deviations where nothing is known [m]; 0 for those that are estimated."""
         terms = [FREE_M if t.n <= FREE_DEGREE else 0.0 for t in self.terms]
-        return np.array([*terms, FREE_M, *np.zeros(self.ring_knots)])
+        return np.array([*terms, FREE_M, *np.zeros(len(self.waves))])
 
     @property
     def degrees(self) -> IntArray:
-        """Degree of each term and of the cone, ``SYMMETRIC`` or ``RINGS`` instead, (k,)."""
-        rings = np.full(self.ring_knots, RINGS)
+        """Degree of each term and of the cone, or ``SYMMETRIC``; ``RINGS`` and below, (k,)."""
         terms = [SYMMETRIC if t.m == 0 and t.n > FREE_DEGREE else t.n for t in self.terms]
-        return np.array([*terms, _CONE, *rings])
+        return np.array([*terms, _CONE, *(RINGS - self._octave)])
 
     def cell_of(self, x: FloatArray, y: FloatArray) -> IntArray:
         """Return the number of the cell at x, y [m] among all of the disc, (n,)."""
@@ -118,10 +112,10 @@ def part_model(blocks: Blocks, turns: float, highest: int = HIGHEST_DEGREE) -> P
     rings = int(np.clip(turns // _TURNS_A_RING, _LEAST_RINGS, _MOST_RINGS))
     terms = terms_up_to(highest)
     about = np.hypot(blocks.x, blocks.y)
-    knots = int(np.clip(turns // _TURNS_A_KNOT, 4, _MOST_KNOTS))
+    waves = np.arange(FREE_DEGREE + 1, min(int(_WAVES_A_TURN * turns), _MOST_WAVES) + 1)
     empty = PartModel(
         Aperture(radius, x, y), terms, rings, np.zeros(0, np.int64), 3 * rings**2,
-        float(np.min(about)), float(np.max(about)), knots,
+        float(np.min(about)), float(np.max(about)), waves,
     )  # fmt: skip
     return replace(empty, cell=empty.cell_of(blocks.x, blocks.y))
 

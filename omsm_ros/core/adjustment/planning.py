@@ -21,7 +21,7 @@ from omsm_ros.core.adjustment.families import (
 )
 from omsm_ros.core.adjustment.figures import POSE, form_map
 from omsm_ros.core.adjustment.network import Network, Scales, solve
-from omsm_ros.core.adjustment.part_terms import FREE_DEGREE, RINGS, SYMMETRIC, part_model
+from omsm_ros.core.adjustment.part_terms import part_model
 from omsm_ros.core.adjustment.refutation import completed
 from omsm_ros.core.adjustment.scan_data import ScanData, view_of, zero_of
 from omsm_ros.core.adjustment.sources import Source, prior_sizes
@@ -124,7 +124,7 @@ def posterior_uncertainty(
     part = part_model(blocks, min(s.turns for s in scans), _DEGREE)
     scales = Scales(
         walk=stated.get("drift_walk", _WALK_M) ** 2 * shorter,
-        bands=dict.fromkeys((SYMMETRIC, RINGS, *range(FREE_DEGREE + 1, _DEGREE + 1)), _BAND_M**2),
+        bands=dict.fromkeys(map(int, part.degrees), _BAND_M**2),
         cells=_CELLS_M**2,
         noise=np.ones(len(scans)),
     )

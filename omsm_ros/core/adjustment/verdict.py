@@ -21,7 +21,7 @@ CONTRADICTED, TOO_UNCERTAIN, INVALID = "contradicted", "too_uncertain", "invalid
 
 # Reasons.
 REFUTED, DISAGREE, WRONG_SIGN = "refuted", "scans_disagree", "wrong_sign"
-WRONG_SENSE = "wrong_sense"
+WRONG_SENSE, SENSE = "wrong_sense", "sense_of_c"
 UNDECLARED_EFFECT, NOT_REDUNDANT, UNCERTAINTY = "undeclared_effect", "not_redundant", "uncertainty"
 NOT_EVALUATED, DECLARED_ONLY = "not_evaluated", "declared_only"
 UNIDENTIFIED, LOOKS_LIKE = "unidentified", "looks_like"
@@ -201,13 +201,14 @@ def looks_like(
 
 
 def rests_on(
-    families: Sequence[Family], effects: Mapping[str, Effect], limit: float
+    families: Sequence[Family], effects: Mapping[str, Effect], limit: float, mirrored: bool
 ) -> tuple[tuple[tuple[str, float], ...], str]:
     """Return the sources that count as they were declared, for these scans do not show them.
 
     Also what each does to the heights as declared, k = 1 [m], the largest first; and the code of
     the scan or artefact that would show most of that.
     limit: a source that may do more if its declaration is worth nothing is one of them [m]
+    mirrored: True if C might count the other way, which makes the mirror image of the form
     """
     found = [
         f
@@ -218,7 +219,8 @@ def rests_on(
     for family in found:
         by[family.shown_by] = by.get(family.shown_by, 0.0) + effects[family.name].left ** 2
     resting = sorted(((f.name, effects[f.name].left) for f in found), key=lambda pair: -pair[1])
-    return tuple(resting), max(by, key=lambda code: by[code], default="")
+    sense = [(SENSE, 0.0)] if mirrored else []
+    return (*sense, *resting), max(by, key=lambda code: by[code], default="")
 
 
 def verdict_of(

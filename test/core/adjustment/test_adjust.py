@@ -172,6 +172,8 @@ def test_a_turned_part_shows_that_c_counts_the_other_way(table):
     """The mirror image of the mirror, whose clocking then has the other sign."""
     _, scans, _ = table
     assert len({s.clocking for s in scans}) == 2
+    right = adjust(scans, PRIORS, nominal=MIRROR)
+    assert "sense_of_c" not in dict(right.verdict.rests_on)
     reflected = [replace(s, y=-s.y, c=-s.c) for s in scans]
     found = adjust(reflected, PRIORS, nominal=MIRROR)
     assert found.verdict.code == CONTRADICTED
@@ -277,6 +279,18 @@ def test_a_turned_part_with_rings_keeps_its_form(seed):
     assert np.max(np.abs(terms)) < 4
     alone = adjust(scans[:1], PRIORS, nominal=MIRROR, accuracy=25e-9)
     assert not alone.refutations
+
+
+def test_rings_of_a_few_turns_are_no_drift():
+    """Both scans cross them, one inwards and one outwards: the walk stays the declared one."""
+
+    def turned(x, y):
+        return rings(x, y) + 4e-9 * np.cos(2 * np.pi * np.hypot(x, y) / 2.4e-3)
+
+    _, scans = drawn(1, 2, pitch=0.8e-3, part=turned)
+    found = adjust(scans, PRIORS, nominal=MIRROR)
+    assert found.drift_walk < 1.2 * 1.2e-9
+    assert "contradicted" not in found.verdict.code
 
 
 @pytest.mark.soak

@@ -138,10 +138,14 @@ def test_a_correction_of_the_wrong_sign_is_seen(scans):
 
 
 def test_what_spirals_to_the_centre_cannot_show_rests_on_its_declaration():
-    """Bent slides and a stretched scale look like the part; they are listed, not verified."""
+    """Bent slides and a stretched scale look like the part; they are listed, not verified.
+
+    So is the sense of C: the mirror is its own mirror image.
+    """
     _, found = disturbed("clean", 2)
     assert found.verdict.code == VERIFIED
     resting = dict(found.verdict.rests_on)
+    assert found.verdict.rests_on[0][0] == "sense_of_c"
     assert {"straightness_x", "encoder_scale", "pitch"} <= set(resting)
     assert max(resting.values()) < 10e-9
 
