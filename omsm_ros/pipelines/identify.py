@@ -116,7 +116,9 @@ def write_certificate(out: Path, identified: Identification, *, source: str = ""
     source: name of the recording, as the page states it
     """
     # Imported on demand, because loading the figures takes a second.
-    from omsm_ros.report.certificate.page import certificate_figures_of, render, render_dcc
+    from omsm_ros.report.certificate.figures import certificate_figures_of
+    from omsm_ros.report.certificate.page import render
+    from omsm_ros.report.certificate.tables import render_dcc
     from omsm_ros.report.page_parts import Issue
 
     calibration = identified.calibration
@@ -136,7 +138,8 @@ def write_model_page(
     source: name of the record, as the page states it
     """
     # Imported on demand, because loading the figures takes a second.
-    from omsm_ros.report.certificate.page import model_figures_of, render_model
+    from omsm_ros.report.certificate.figures import model_figures_of
+    from omsm_ros.report.certificate.page import render_model
     from omsm_ros.report.page_parts import Issue
 
     figures = model_figures_of(model, record.inputs, record.output, run)

@@ -1,4 +1,4 @@
-"""Figures of a certificate: the response with its band, the residual, the order.
+"""Figures of a certificate, with captions: the response with its band, the residual, the order.
 
 Every function returns a matplotlib Figure that belongs to the caller; all arguments are SI.
 """
@@ -25,7 +25,7 @@ from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.readable import quantity
 from omsm_ros.report import style
-from omsm_ros.report.response_figures import bode
+from omsm_ros.report.response_figures import bode, step_response
 from omsm_ros.units import DEGREE_RAD, MILLISECOND_S, NANOMETRE_M
 
 _COHERENT = 0.5
@@ -35,6 +35,30 @@ _LAGS = 25
 _LIMIT: dict[str, Any] = {"color": style.TRUTH, "linewidth": 0.8, "linestyle": (0, (4, 2))}
 _SPAN: dict[str, Any] = {"color": style.AFTER, "alpha": 0.18, "linewidth": 0}
 _BEFORE_EDGE_S, _AFTER_EDGE_S = 30e-3, 60e-3
+
+
+BAND = "band"
+CAPTIONS = {
+    BAND: (
+        "Gain, phase, and the error of a sinusoidal motion before and after the correction. "
+        "Grey: outside of the valid range."
+    ),
+    "step": "The steepest move: input, output, and the residual of the model.",
+    "residual": (
+        "The residual over the whole recording, at the edges on top of each other "
+        "(downward ones turned over), and from sample to sample."
+    ),
+    "order": ("Each candidate is a structure that was fitted to the same samples."),
+}
+RECORD, CORRELATION = "record", "correlation"
+CAPTIONS_OF_MODEL = {
+    BAND: "Gain and phase with their 95 % band. Grey: not known within the limits.",
+    RECORD: (
+        "The record, and what the model makes of its input alone; the state that it starts in "
+        "is fitted."
+    ),
+    CORRELATION: "From sample to sample: outside the shade the residual is not white.",
+}
 
 
 def response_with_band(calibration: Calibration, seen: FrequencyResponse | None = None) -> Figure:
@@ -241,3 +265,30 @@ def correlation(run: FreeRun) -> Figure:
     made, axes = style.figure(7.4, 2.6)
     draw_correlation(axes[0, 0], run.residual)
     return made
+
+
+def certificate_figures_of(calibration: Calibration, fitted: FittedRecord) -> dict[str, bytes]:
+    """Return PNG files for the page."""
+    certificate = calibration.certificate
+    # Matplotlib leaves gaps at NaN, an edge's median does not.
+    bridged = np.where(np.isfinite(fitted.output), fitted.output, fitted.modelled)
+    made = {
+        BAND: response_with_band(calibration, fitted.measured),
+        "step": step_response(fitted.time, fitted.input, bridged, fitted.modelled),
+        "residual": residual(fitted, certificate.residual.noise_m),
+    }
+    if certificate.candidates:
+        made["order"] = order(certificate.candidates, certificate.structure)
+    return {name: style.png(figure) for name, figure in made.items()}
+
+
+def model_figures_of(
+    model: SampledModel, inputs: FloatArray, output: FloatArray, run: FreeRun
+) -> dict[str, bytes]:
+    """Return PNG files for the page."""
+    made = {
+        BAND: response(model),
+        RECORD: record(model, inputs, output, run),
+        CORRELATION: correlation(run),
+    }
+    return {name: style.png(figure) for name, figure in made.items()}

@@ -1,65 +1,34 @@
 """Pages to file, each HTML in one piece: certificate of a calibration, and a sampled model."""
 
 from collections.abc import Mapping
-from datetime import datetime, timezone
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import REJECTED, Certificate, to_json
 from omsm_ros.core.estimation.sampled_model import SCHEMA, FreeRun, SampledModel
-from omsm_ros.core.identification.fitted_record import FittedRecord
-from omsm_ros.core.lti.frequency_response import (
-    COVERAGE_FACTOR,
-    low_frequency_delay_uncertainty,
-    response_band,
-)
-from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, response_band
 from omsm_ros.readable import NOTHING, count, measured, percent, plain, probability, quantity
-from omsm_ros.report import style
-from omsm_ros.report.certificate import figures as certificate_figures
 from omsm_ros.report.certificate import tables
+from omsm_ros.report.certificate.figures import (
+    BAND,
+    CAPTIONS,
+    CAPTIONS_OF_MODEL,
+    CORRELATION,
+    RECORD,
+)
 from omsm_ros.report.certificate.tables import known_rows
 from omsm_ros.report.page_parts import Headline, Issue, Section, fill, picture, present, title_block
-from omsm_ros.report.response_figures import step_response
 from omsm_ros.report.tables import Table, latency_text, mapping_table, part
 from omsm_ros.report.verdict import PageVerdict, verdict_text
-from omsm_ros.units import DEGREE_RAD, NANOSECONDS_PER_S, PPM
+from omsm_ros.units import DEGREE_RAD, PPM
 
-BAND = "band"
-CAPTIONS = {
-    BAND: (
-        "Gain, phase, and the error of a sinusoidal motion before and after the correction. "
-        "Grey: outside of the valid range."
-    ),
-    "step": "The steepest move: input, output, and the residual of the model.",
-    "residual": (
-        "The residual over the whole recording, at the edges on top of each other "
-        "(downward ones turned over), and from sample to sample."
-    ),
-    "order": ("Each candidate is a structure that was fitted to the same samples."),
-}
 _CLOSING = (
     "On a fixed target the probe reads offset + drift ∓ static gain · G_m z, with G_m(0) = 1 and z "
     "from the encoder. The sign is − where the distance falls when Z rises, else +. "
     "After ± stands the standard uncertainty, k = 1; bands are 95 %."
 )
-
-
-def certificate_figures_of(calibration: Calibration, fitted: FittedRecord) -> dict[str, bytes]:
-    """Return PNG files for the page."""
-    certificate = calibration.certificate
-    # Matplotlib leaves gaps at NaN, an edge's median does not.
-    bridged = np.where(np.isfinite(fitted.output), fitted.output, fitted.modelled)
-    made = {
-        BAND: certificate_figures.response_with_band(calibration, fitted.measured),
-        "step": step_response(fitted.time, fitted.input, bridged, fitted.modelled),
-        "residual": certificate_figures.residual(fitted, certificate.residual.noise_m),
-    }
-    if certificate.candidates:
-        made["order"] = certificate_figures.order(certificate.candidates, certificate.structure)
-    return {name: style.png(figure) for name, figure in made.items()}
 
 
 def render(calibration: Calibration, issue: Issue) -> str:
@@ -259,11 +228,11 @@ def _laboratory(calibration: Calibration) -> list[Section]:
     certificate = calibration.certificate
     origin, validity = certificate.origin, certificate.validity
     results = []
-    for one in dcc_quantities(calibration):
-        unit = _UNITS[one.unit]
+    for one in tables.dcc_quantities(calibration):
+        unit = tables.DCC_UNITS[one.unit]
         value = measured(one.value, (one.expanded or 0.0) / 2, unit).partition(" ±")[0]
         expanded = quantity(one.expanded, unit, 2) if unit else plain(one.expanded, 2)
-        results.append((one.name, value, _UNSTATED if one.expanded is None else expanded))
+        results.append((one.name, value, tables.UNSTATED if one.expanded is None else expanded))
     start = quantity(validity.from_hz or 0.0, "Hz", 2)
     stated = (
         ("method", origin.method or "step test on a fixed target; transfer function from encoder "
@@ -287,103 +256,10 @@ def _laboratory(calibration: Calibration) -> list[Section]:
     ]
 
 
-_UNITS = {r"\second": "s", r"\one": "", r"\hertz": "Hz", r"\radian": "rad"}
-# Shares of the valid band at which gain and phase are stated.
-_DCC_SHARES = (0.01, 0.1, 0.25, 0.5, 0.75, 1.0)
-_UNSTATED = "not stated"
-_ENCODER = (
-    "Lengths are those of the encoder of Z. Its traceability is not part of this certificate."
-)
-
-
-class Quantity(NamedTuple):
-    """A result in SI units; ``expanded``: k = 2, None if not evaluated."""
-
-    kind: str
-    name: str
-    value: float
-    unit: str
-    expanded: float | None = None
-
-
-def dcc_quantities(calibration: Calibration) -> list[Quantity]:
-    """Return lag, static gain, valid range, and gain and phase within it."""
-    dynamics, certificate = calibration.dynamics, calibration.certificate
-    lag = 2 * low_frequency_delay_uncertainty(dynamics, calibration.covariance)
-    spread = certificate.static_gain.uncertainty
-    found = [
-        Quantity("omsm_lag", "lag at low frequency", dynamics.low_frequency_delay, r"\second", lag),
-        Quantity("omsm_gain", "static gain, probe per encoder", calibration.static_gain, r"\one",
-                 None if spread is None else 2 * spread),
-        Quantity("omsm_valid", "valid up to", calibration.valid_up_to, r"\hertz"),
-    ]  # fmt: skip
-    at = np.array(_DCC_SHARES) * calibration.valid_up_to
-    band, response = response_band(dynamics, calibration.covariance, at), dynamics.response(at)
-    for k, frequency in enumerate(at.tolist()):
-        gain, phase = float(abs(response[k])), float(np.angle(response[k]))
-        wide, turned = 2 * float(band.gain[k]), 2 * float(band.phase[k])
-        place = f"at {frequency:.6g} Hz"
-        found.append(Quantity("omsm_response", f"gain {place}", gain, r"\one", gain * wide))
-        found.append(Quantity("omsm_response", f"phase {place}", phase, r"\radian", turned))
-    return found
-
-
-def render_dcc(calibration: Calibration, version: str) -> str:
-    """Return the certificate as XML; all text from outside is escaped."""
-    origin = calibration.certificate.origin
-    now, recorded = datetime.now(timezone.utc), origin.recorded_ns
-    when = datetime.fromtimestamp(recorded / NANOSECONDS_PER_S, timezone.utc) if recorded else now
-    warm = origin.temperature_c
-    return fill(
-        "certificate_dcc.xml",
-        version=version,
-        identity=calibration.id,
-        day=when.date().isoformat(),
-        machine=_word(origin.machine or str(calibration.settings.get("machine", ""))),
-        probe=_word(origin.probe),
-        serial=_word(origin.probe_serial_number),
-        laboratory=_word(origin.laboratory),
-        customer=_word(origin.customer),
-        operator=_word(origin.operator),
-        traceability=_word(origin.traceability or _ENCODER),
-        method=_word(origin.method or "step test on a fixed target"),
-        verdict=_word(verdict_text(calibration) or "no certificate"),
-        temperature=None if warm is None else Quantity(
-            "basic_temperature", "temperature", warm, r"\degreeCelsius"),
-        quantities=dcc_quantities(calibration),
-    ).lstrip()  # fmt: skip
-
-
-def _word(value: str | None) -> str:
-    """Return a text without spaces at its ends, which the schema forbids."""
-    return " ".join((value or "").split()) or _UNSTATED
-
-
-_RECORD, _CORRELATION = "record", "correlation"
-_CAPTIONS_OF_MODEL = {
-    BAND: "Gain and phase with their 95 % band. Grey: not known within the limits.",
-    _RECORD: (
-        "The record, and what the model makes of its input alone; the state that it starts in "
-        "is fitted."
-    ),
-    _CORRELATION: "From sample to sample: outside the shade the residual is not white.",
-}
 _CLOSING_OF_MODEL = (
     "The model is of deviations from the working point. The file has its coefficients and their "
     "covariance."
 )
-
-
-def model_figures_of(
-    model: SampledModel, inputs: FloatArray, output: FloatArray, run: FreeRun
-) -> dict[str, bytes]:
-    """Return PNG files for the page."""
-    made = {
-        BAND: certificate_figures.response(model),
-        _RECORD: certificate_figures.record(model, inputs, output, run),
-        _CORRELATION: certificate_figures.correlation(run),
-    }
-    return {name: style.png(figure) for name, figure in made.items()}
 
 
 def render_model(model: SampledModel, run: FreeRun, issue: Issue) -> str:
@@ -399,7 +275,7 @@ def render_model(model: SampledModel, run: FreeRun, issue: Issue) -> str:
         sections=_model_sections(model, issue),
         band=BAND,
         picture=lambda name: picture(issue.figures[name]),
-        caption=_CAPTIONS_OF_MODEL.__getitem__,
+        caption=CAPTIONS_OF_MODEL.__getitem__,
     )
 
 
@@ -443,7 +319,7 @@ def _model_sections(model: SampledModel, issue: Issue) -> list[Section]:
     limits = tables.limit_rows(stated if isinstance(stated, Mapping) else {})
     judged_by = Table("Limits of the verdict", (), known_rows(limits, 1))
     every = [
-        Section("Record", (_RECORD, _CORRELATION), (Table("", (), known_rows(tests, 1)),)),
+        Section("Record", (RECORD, CORRELATION), (Table("", (), known_rows(tests, 1)),)),
         Section("Poles", (), (_model_poles(certificate),)),
         Section("Records", (), (_model_identity(model, issue), judged_by)),
     ]

@@ -8,7 +8,8 @@ from parsed_page import Page
 from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.streams.motion_record import assemble
-from omsm_ros.report.certificate.page import certificate_figures_of, render
+from omsm_ros.report.certificate.figures import certificate_figures_of
+from omsm_ros.report.certificate.page import render
 from omsm_ros.report.page_parts import Issue
 
 

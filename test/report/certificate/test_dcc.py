@@ -10,7 +10,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from omsm_ros.report.certificate.page import dcc_quantities, render_dcc
+from omsm_ros.report.certificate.tables import dcc_quantities, render_dcc
 
 SI = "{https://ptb.de/si}"
 

@@ -7,8 +7,8 @@ import pytest
 from sections_of_polynomials import from_polynomials
 
 from omsm_ros.core.estimation.sampled_model import SampledModel, free_run
-from omsm_ros.report.certificate.figures import response
-from omsm_ros.report.certificate.page import model_figures_of, render_model, verdict_on_model
+from omsm_ros.report.certificate.figures import model_figures_of, response
+from omsm_ros.report.certificate.page import render_model, verdict_on_model
 from omsm_ros.report.page_parts import Issue
 
 HELD = SampledModel(

@@ -16,7 +16,8 @@ from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import CalibrationError
 from omsm_ros.report import style
 from omsm_ros.report.certificate import figures as certificate_figures
-from omsm_ros.report.certificate.page import CAPTIONS, render, sections, verdict_on_calibration
+from omsm_ros.report.certificate.figures import CAPTIONS
+from omsm_ros.report.certificate.page import render, sections, verdict_on_calibration
 from omsm_ros.report.page_parts import Issue
 from omsm_ros.report.verdict import verdict_text
 
