@@ -131,6 +131,12 @@ def measured(value: object, uncertainty: object, unit: str = "", digits: int = 4
     return " ± ".join(f"{part:.{max(decimals, 0)}f}{tail}" for part in shown)
 
 
+def standard(value: object, uncertainty: object, unit: str = "", digits: int = 4) -> str:
+    """Return a value and its standard uncertainty, if known: ``339.7 µs ± 1.1 µs (k = 1)``."""
+    text = measured(value, uncertainty, unit, digits)
+    return f"{text} ± unknown" if uncertainty is None else f"{text} (k = 1)"
+
+
 def expanded(value: object, uncertainty: object, unit: str = "", signed: bool = False) -> str:
     """Return a value and its expanded uncertainty: ``10.9 nm ± 4.5 nm (k = 2)``.
 

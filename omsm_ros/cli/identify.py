@@ -59,7 +59,7 @@ from omsm_ros.quantities import (
     UNCERTAINTY,
     shown,
 )
-from omsm_ros.readable import count, measured, percent, plain, quantity
+from omsm_ros.readable import count, percent, plain, quantity, standard
 from omsm_ros.report.verdict import verdict_text
 
 ENCODER = "encoder"
@@ -330,12 +330,6 @@ _RISES = (
 )
 
 
-def _stated(facts: Facts, name: str, unit: str) -> str:
-    spread = facts[f"{name}_uncertainty"]
-    text = measured(facts[name], spread, unit, 6)
-    return f"{text} ± unknown" if spread is None else f"{text} (k = 1)"
-
-
 def _show(facts: Facts) -> None:
     rows = [("verdict", facts["verdict"]), ("order", str(facts["order"]))]
     if "model" in facts:
@@ -349,14 +343,18 @@ def _show(facts: Facts) -> None:
             ),
         ]
     else:
+        lag, gain = (
+            standard(facts[name], facts[f"{name}_uncertainty"], unit, 6)
+            for name, unit in (("low_frequency_delay", "s"), ("static_gain", ""))
+        )
         rows += [
-            ("lag of Z", _stated(facts, "low_frequency_delay", "s")),
-            ("static gain", _stated(facts, "static_gain", "")),
+            ("lag of Z", lag),
+            ("static gain", gain),
             ("valid up to", quantity(facts["valid_up_to"], "Hz")),
         ]
         for name, found in facts["further_axes"].items():
-            text = measured(found["gain"], found["gain_uncertainty"], "", 6)
-            rows.append((f"gain of {name.upper()}", f"{text} (k = 1)"))
+            text = standard(found["gain"], found["gain_uncertainty"], "", 6)
+            rows.append((f"gain of {name.upper()}", text))
         if facts["polarity"] == -1:
             rows.append(("distance", _RISES))
     if "equivalent_time" in facts:

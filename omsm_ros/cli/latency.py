@@ -25,7 +25,7 @@ from omsm_ros.quantities import (
     LAG,
     TIME_UNCERTAINTY,
 )
-from omsm_ros.readable import measured, percent, quantity
+from omsm_ros.readable import percent, quantity, standard
 from omsm_ros.report.verdict import verdict_text
 from omsm_ros.units import RPM_RAD_S
 
@@ -86,7 +86,7 @@ def _show_selfcal(facts: Facts) -> None:
             ("verdict", facts["verdict"]),
             *(("reason", text) for text in facts["reasons"]),
             ("scans", ", ".join(f"{speed:.1f} rpm" for speed in facts["speeds_rpm"])),
-            ("lag of Z", _time(facts["lag"], facts["lag_uncertainty"])),
+            ("lag of Z", standard(facts["lag"], facts["lag_uncertainty"], "s")),
             *_latency_rows(facts["latency"]),
             ("valid up to", quantity(facts["valid_up_to"], "Hz")),
             ("residual error", f"{quantity(facts['left_on_this_surface'], 'm')} rms on this "
@@ -98,15 +98,10 @@ def _show_selfcal(facts: Facts) -> None:
     )  # fmt: skip
 
 
-def _time(seconds: float, spread: float | None) -> str:
-    stated = measured(seconds, spread, "s")
-    return f"{stated} ± unknown" if spread is None else f"{stated} (k = 1)"
-
-
 def _latency_rows(latency: Facts) -> list[tuple[str, str]]:
     share = latency["share"]
     return [
-        ("probe latency", _time(latency["delay_s"], latency["uncertainty_s"])),
+        ("probe latency", standard(latency["delay_s"], latency["uncertainty_s"], "s")),
         ("share of the lag", "unknown" if share is None else percent(share, 3)),
         ("source", f"{latency['source']}: {latency['reason']}"),
     ]
@@ -143,7 +138,7 @@ _MEANINGS = {
 def _show_reversal(facts: Facts) -> None:
     table(
         [
-            ("probe latency", _time(facts["lag"], facts["uncertainty"])),
+            ("probe latency", standard(facts["lag"], facts["uncertainty"], "s")),
             ("lag of Z", quantity(facts["lag_of_z"], "s", 4)),
             ("meaning", _MEANINGS[facts["latency"]]),
             ("residual", f"{quantity(facts['residual'], 'm')} rms"),
@@ -175,7 +170,7 @@ def _latency(args: argparse.Namespace) -> Facts:
 def _show_latency(facts: Facts) -> None:
     table(
         [
-            ("lag of Z", _time(facts["lag"], facts["lag_uncertainty"])),
+            ("lag of Z", standard(facts["lag"], facts["lag_uncertainty"], "s")),
             *_latency_rows(facts["latency"]),
             written([facts["calibration"]]),
         ]

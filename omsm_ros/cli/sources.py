@@ -22,7 +22,7 @@ from omsm_ros.messages.verdict import source_name
 from omsm_ros.pipelines.adjust import read_scan
 from omsm_ros.pipelines.study_scans import alignment_of
 from omsm_ros.quantities import RADIUS
-from omsm_ros.readable import date_text_of_stamp, measured, now_text
+from omsm_ros.readable import date_text_of_stamp, now_text, standard
 
 _SPHERE = "sphere"
 _HOW = """\
@@ -100,8 +100,8 @@ def _show(facts: Facts) -> None:
     for entry in facts["sources"]:
         order = f"/{entry['per_turn']:g}" if "per_turn" in entry else ""
         unit = "" if entry["unit"] == "1" else entry["unit"]
-        text = measured(entry["found"], entry["uncertainty"], unit)
-        rows.append((source_name(entry["source"] + order), f"{text} (k = 1)"))
+        text = standard(entry["found"], entry["uncertainty"], unit)
+        rows.append((source_name(entry["source"] + order), text))
     rows += [(source_name(name), "not shown by this recording") for name in facts["not_shown"]]
     table([*rows, written([facts["file"]])])
 

@@ -10,14 +10,8 @@ from omsm_ros.core.calibration.certificate import REJECTED, Certificate, to_json
 from omsm_ros.core.estimation.sampled_model import SCHEMA, FreeRun, SampledModel
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, response_band
 from omsm_ros.readable import NOTHING, count, measured, percent, plain, probability, quantity
+from omsm_ros.report.certificate import figures as drawn
 from omsm_ros.report.certificate import tables
-from omsm_ros.report.certificate.figures import (
-    BAND,
-    CAPTIONS,
-    CAPTIONS_OF_MODEL,
-    CORRELATION,
-    RECORD,
-)
 from omsm_ros.report.certificate.tables import known_rows
 from omsm_ros.report.page_parts import Headline, Issue, Section, fill, picture, present, title_block
 from omsm_ros.report.tables import Table, latency_text, mapping_table, part
@@ -45,9 +39,9 @@ def render(calibration: Calibration, issue: Issue) -> str:
         sections=sections(calibration, issue),
         block=title_block(to_json(origin)),
         signer=origin.operator or "",
-        band=BAND,
+        band=drawn.BAND,
         picture=lambda name: picture(issue.figures[name]),
-        caption=CAPTIONS.__getitem__,
+        caption=drawn.CAPTIONS.__getitem__,
     )
 
 
@@ -273,9 +267,9 @@ def render_model(model: SampledModel, run: FreeRun, issue: Issue) -> str:
         verdict=verdict_on_model(model),
         headlines=_model_headlines(model, run),
         sections=_model_sections(model, issue),
-        band=BAND,
+        band=drawn.BAND,
         picture=lambda name: picture(issue.figures[name]),
-        caption=CAPTIONS_OF_MODEL.__getitem__,
+        caption=drawn.CAPTIONS_OF_MODEL.__getitem__,
     )
 
 
@@ -318,8 +312,9 @@ def _model_sections(model: SampledModel, issue: Issue) -> list[Section]:
     stated = part(certificate, "limits")
     limits = tables.limit_rows(stated if isinstance(stated, Mapping) else {})
     judged_by = Table("Limits of the verdict", (), known_rows(limits, 1))
+    shown = (drawn.RECORD, drawn.CORRELATION)
     every = [
-        Section("Record", (RECORD, CORRELATION), (Table("", (), known_rows(tests, 1)),)),
+        Section("Record", shown, (Table("", (), known_rows(tests, 1)),)),
         Section("Poles", (), (_model_poles(certificate),)),
         Section("Records", (), (_model_identity(model, issue), judged_by)),
     ]

@@ -227,10 +227,7 @@ PROFILES = {
     "profile_radius": "Mean of each ring: rotationally symmetric error.",
 }
 ERRORS = {"dynamic_error": "Before and after: mind the different scales."}
-DYNAMICS = {
-    "bode": "Grey: above the frequency up to which the calibration is valid.",
-    "step_response": "One edge of the step test, and the residual of the model.",
-}
+DYNAMICS = {"bode": "Grey: above the frequency up to which the calibration is valid."}
 FORM = {
     "form_map": "Pose removed. ×: left out as dust. Hatched: aperture without points.",
     "form_lines": "Along the normal, pose removed, mean over 1/50 of the radius; k = 2.",
