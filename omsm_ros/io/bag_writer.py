@@ -149,14 +149,14 @@ class BagWriter:
     def __enter__(self) -> BagWriter:
         self._file = new_bag_file(self.path)
         self._writer = new_writer(self._file)
-        for topic, name in self._names.items():
-            self._channels[topic] = self._channel(name, topic)
         try:
             with self._room():
                 self._file.flush()
         except BagError:
             self.path.unlink()
             raise
+        for topic, name in self._names.items():
+            self._channels[topic] = self._channel(name, topic)
         return self
 
     def _channel(self, name: str, topic: str) -> int:

@@ -50,6 +50,20 @@ def test_an_existing_bag_is_refused_and_untouched(tmp_path):
     assert not (tmp_path / "nowhere").exists()
 
 
+def test_the_file_is_a_bag_before_its_channels_are_described(tmp_path, monkeypatch):
+    # A recorder killed within a tenth of a second after its start left an empty file, no bag.
+    path, plain, profiles = tmp_path / "scan.mcap", BagWriter._channel, []
+
+    def killed_here(bag, name, topic):
+        with path.open("rb") as file:
+            profiles.append(make_reader(file).get_header().profile)
+        return plain(bag, name, topic)
+
+    monkeypatch.setattr(BagWriter, "_channel", killed_here)
+    with BagWriter(path, TOPICS):
+        assert profiles == ["ros2"] * len(TOPICS)
+
+
 def test_the_bag_can_be_read_while_it_grows(tmp_path, axes):
     path = tmp_path / "scan.mcap"
     with BagWriter(path, TOPICS) as bag:
