@@ -59,7 +59,6 @@ estimation.too_few_samples: {samples} samples are used, at least {least} are nee
     {order}; record more, or ask for a lower order
 estimation.short_record: {samples} samples are used, at least {least} are needed, and a finite input
     everywhere; record more
-estimation.constant_input: the input never changes; excite it while recording
 estimation.few_frequencies: the input excites {excited} parameters only, {needed} are needed for
     order {order}: each of its frequencies determines a gain and a phase; record with steps, noise,
     or more frequencies at once

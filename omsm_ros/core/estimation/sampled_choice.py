@@ -9,12 +9,13 @@ A few thousand samples determine the order as well as all, except for dynamics s
 last; so the orders of a long record are explored on its most exciting part.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import signal
 
+from omsm_ros.core.estimation.covariance import autoregression
 from omsm_ros.core.estimation.impulse_response import coherent_power, gram_of, impulse_response
 from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, ParallelSections
 from omsm_ros.core.estimation.sampled_fit import (
@@ -81,21 +82,23 @@ class SampledCandidate:
 
 @dataclass(frozen=True, eq=False)
 class SampledChoice:
-    """The chosen model, and the free choice.
+    """The chosen model, and the others.
 
-    chosen: of the order asked for, or the free choice;  free: the free choice
-    alternatives: larger models that predict about as well, in sample periods
-    comparator: share of the variance over the last part that an impulse response explains at the
-        frequencies of the inputs, and ``compared`` that of the model of the chosen order; None
-        where the records are too short
+    chosen: of the order asked for, or the free choice;  free: that one, as it was compared
+    others: models of every order compared, in sample periods
+    evidence: weight of each (c,), times the share of the samples on which they were compared
+    alternatives: the larger of them that predict about as well
+    impulse_response: share of the variance over the last part that it, as a "comparator", explains
+        at the frequencies of the inputs, and the "model"; None where the records are too short
     worse: the model is worse by more than the uncertainty of the comparison
     """
 
     chosen: SampledCandidate
     free: SampledCandidate
+    others: Sequence[ParallelSections]
+    evidence: FloatArray
     alternatives: Sequence[ParallelSections]
-    comparator: float | None
-    compared: float | None
+    impulse_response: Mapping[str, float | None]
     worse: bool
 
 
@@ -121,19 +124,37 @@ def choose_sampled(
     early = replace(explored, records=[_early(record) for record in explored.records])
     fits, by_order = _explore(early, explored, most, order, lag)
     orders = [fitted.order for fitted in fits]
-    judged = []
-    for fitted in (fits[orders.index(n)] for n in _finalists(orders, by_order, order)):
+    best = np.argsort(by_order, kind="stable")[:_FINALISTS]
+    alike = np.flatnonzero(by_order <= _EQUIVALENT * np.min(by_order))[:_FINALISTS]
+    finalists, judged = {0, 1, order, *(orders[i] for i in (*best, *alike))}, []
+    for fitted in (fitted for fitted in fits if fitted.order in finalists):
         refitted = explored.fit(fitted.order, [fitted.nonlinear], _EXPLORING)
         judged.append(SampledCandidate(refitted, validation_errors(refitted)))
     free = simplest_undominated(judged)
     chosen = free if not order else next(c for c in judged if c.fit.order == order)
     comparison = _against_impulse_response(explored, fits[orders.index(chosen.fit.order)])
     finished = _finished(whole, chosen, every)
-    other = finished if chosen is free else _finished(whole, free, every)
+    others = [c.fit.model(float(every)) for c in judged]
     bound = _ALIKE * np.mean(chosen.held_out)
-    alike = [c for c in judged if c.fit.order > chosen.fit.order and np.mean(c.held_out) <= bound]
-    larger = [c.fit.model(float(every)) for c in alike]
-    return SampledChoice(finished, other, larger, *comparison)
+    about = [c.fit.order > chosen.fit.order and np.mean(c.held_out) <= bound for c in judged]
+    larger = [other for other, as_well in zip(others, about, strict=True) if as_well]
+    share = len(chosen.fit.residual) * every / len(finished.fit.residual)
+    return SampledChoice(finished, free, others, share * _evidence(judged), larger, *comparison)
+
+
+def _evidence(judged: Sequence[SampledCandidate]) -> FloatArray:
+    """Return the weights of Akaike (c,), in the coloured noise that the largest model leaves."""
+    whitening, _ = autoregression(max(judged, key=lambda c: c.fit.order).fit.residual)
+    scores = []
+    for fitted in (c.fit for c in judged):
+        white = signal.lfilter(whitening, [1.0], fitted.residual)
+        # Initial states and offset of each record are free, too.
+        free = len(fitted.nonlinear) + fitted.linear.size
+        free += len(fitted.problem.records) * (fitted.order + 1)
+        power = max(float(white @ white), np.finfo(float).tiny)
+        scores.append(0.5 * len(white) * np.log(power) + free)
+    weights = np.exp(np.min(scores) - scores)
+    return np.asarray(weights / np.sum(weights))
 
 
 def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsProblem, int, int]:
@@ -142,18 +163,17 @@ def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsPr
     Where the inputs are slow, the records are decimated. Samples of slow inputs are band-limited.
     """
     every = min(_decimation(record) for record in whole.records)
-    while True:
+    while every:
         records = _exciting_parts([_thinned(record, every) for record in whole.records])
         try:
             most = min(most, check_records(records, order))
         except IdentificationError:
-            if every == 1:
-                # No part excites as much as the whole record.
-                return whole, 1, most
             every //= 2
         else:
             held = (whole.hold, whole.delays) if every == 1 else (BAND_LIMITED, 0 * whole.delays)
             return SectionsProblem(records, *held), every, most
+    # No part excites as much as the whole record.
+    return whole, 1, most
 
 
 def _thinned(record: SampledRecord, every: int) -> SampledRecord:
@@ -198,8 +218,6 @@ def excited_parameters(input: FloatArray, most: int) -> int:
     That is its order of persistent excitation with a constant (Ljung 1999, ch. 13): the rank of
     all its windows of ``most`` samples. Each sine gives two, noise gives all.
     """
-    if np.ptp(input) == 0:
-        raise IdentificationError("estimation.constant_input")
     varied = (input - np.mean(input))[:, np.newaxis]
     gram, _ = gram_of(varied, np.zeros(len(input) - most + 1), most)
     power = np.linalg.eigvalsh(gram)
@@ -339,12 +357,6 @@ def _missed(fitted: SectionsFit, whole: SectionsProblem) -> float:
         return float(np.mean(np.nan_to_num(every**2, nan=np.inf))) if len(every) else np.inf
 
 
-def _finalists(orders: Sequence[int], missed: FloatArray, asked: int) -> list[int]:
-    best = np.argsort(missed, kind="stable")[:_FINALISTS]
-    alike = np.flatnonzero(missed <= _EQUIVALENT * np.min(missed))[:_FINALISTS]
-    return sorted({0, 1, asked, *(orders[i] for i in (*best, *alike))} & {*orders})
-
-
 def validation_errors(fitted: SectionsFit, evaluations: int = _REFITTED) -> FloatArray:
     """Return the mean square error over each held-out part, refitted without it, (folds,).
 
@@ -399,19 +411,15 @@ def _finished(whole: SectionsProblem, candidate: SampledCandidate, every: int) -
         held = whole.hold != BAND_LIMITED
         roots = np.asarray((2 * np.tanh(turned / 2) if held else turned) / RATE)
     found = whole.fit(fitted.order, [whole.nonlinear_of(roots, late)], _FINAL)
-    if every == 1:
-        return replace(candidate, fit=found)
-    part = replace(whole, records=[_early(record) for record in whole.records])
-    rest = part.fit(fitted.order, [found.nonlinear], _REFITTED)
-    return SampledCandidate(found, np.array([_missed(rest, whole)]))
+    return replace(candidate, fit=found)
 
 
 def _against_impulse_response(
     whole: SectionsProblem, fitted: SectionsFit
-) -> tuple[float | None, float | None, bool]:
+) -> tuple[dict[str, float | None], bool]:
     """Return what an impulse response and ``fitted`` explain of held-out samples, as shares.
 
-    The third value is True if the model is worse by more than the uncertainty of the comparison.
+    The second value is True if the model is worse by more than the uncertainty of the comparison.
     """
     record, own = whole.records[0], fitted.problem.records[0]
     inputs = record.inputs - np.mean(record.inputs, axis=0)
@@ -425,7 +433,7 @@ def _against_impulse_response(
     end = int(np.flatnonzero(used)[-1]) + 1
     taps = impulse_response(inputs[:end], output[:end], used[:end])
     if taps is None or np.sum(held_out) < _BLOCKS:
-        return None, None, False
+        return {"comparator": None, "model": None}, False
     free = output.copy()
     for drive, response in zip(inputs.T, taps, strict=True):
         free -= signal.fftconvolve(drive, response)[: len(drive)]
@@ -437,7 +445,7 @@ def _against_impulse_response(
     uncertain = float(np.std(apart, ddof=1)) / np.sqrt(_BLOCKS)
     shares = 1 - np.mean(means, axis=1)
     worse = float(np.mean(apart)) > max(_CLEARLY * uncertain, _NOTICEABLE)
-    return float(shares[0]), float(shares[1]), bool(worse)
+    return {"comparator": float(shares[0]), "model": float(shares[1])}, bool(worse)
 
 
 def _decimation(record: SampledRecord) -> int:

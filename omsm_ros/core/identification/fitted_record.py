@@ -109,7 +109,8 @@ def mean_at_edges(fitted: FittedRecord, before: float, after: float) -> EdgeMean
     offsets = np.arange(-round(before / period), round(after / period) + 1)
     found = []
     for edge in fitted.edges:
-        index = _middle(fitted.input, edge) + offsets
+        travelled = np.abs(fitted.input[edge.start : edge.stop] - fitted.input[edge.start])
+        index = edge.start + np.argmax(travelled > 0.5 * abs(edge.height)) + offsets
         if index[0] >= 0 and index[-1] < len(missed):
             found.append(np.sign(edge.height) * missed[index])
     if not found:
@@ -119,8 +120,3 @@ def mean_at_edges(fitted: FittedRecord, before: float, after: float) -> EdgeMean
     total = np.sum(np.where(known, stacked, 0.0), axis=0)
     mean = np.asarray(total / np.maximum(np.sum(known, axis=0), 1), np.float64)
     return EdgeMean(np.asarray(offsets * period, np.float64), mean, len(found))
-
-
-def _middle(motion: FloatArray, edge: Edge) -> int:
-    travelled = np.abs(motion[edge.start : edge.stop] - motion[edge.start])
-    return edge.start + int(np.argmax(travelled > 0.5 * abs(edge.height)))

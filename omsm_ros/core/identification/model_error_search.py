@@ -251,9 +251,10 @@ def _modelled_as_poles(
     prepared: Prepared, model: ChosenModel, budget: EvaluationBudget
 ) -> list[ScoreTest]:
     """Return nuisance terms that ``model`` fits by poles: with them a simple model is better."""
-    chosen, best = model.chosen, _best_plain(model)
-    if chosen.fit.structure.poles <= _PLAIN_POLES or best is None:
+    chosen, plain = model.chosen, _plain_candidates(model)
+    if chosen.fit.structure.poles <= _PLAIN_POLES or not plain:
         return []
+    best = min(plain, key=lambda candidate: candidate.bic).fit
     diagnostics = ResidualDiagnostics(prepared.problem, best, prepared.steps, _NUISANCE_FAMILIES)
     fewer = diagnostics.thinned
     # If the decimated record shows none, all samples need not be tested.
@@ -383,11 +384,6 @@ def _bases(model: ChosenModel) -> list[Fit]:
     chosen, candidates = model.chosen.fit, _plain_candidates(model)
     plain = choose_candidate(candidates).fit if candidates else chosen
     return [chosen] if plain is chosen else [chosen, plain]
-
-
-def _best_plain(model: ChosenModel) -> Fit | None:
-    plain = _plain_candidates(model)
-    return min(plain, key=lambda candidate: candidate.bic).fit if plain else None
 
 
 def _plain_candidates(model: ChosenModel) -> list[Candidate]:

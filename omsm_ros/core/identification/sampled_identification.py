@@ -34,7 +34,7 @@ from omsm_ros.core.estimation.sampled_model import (
 )
 from omsm_ros.core.estimation.steps import LEAST_SAMPLES
 from omsm_ros.core.identification.residual_tests import independence, whiteness
-from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, Band, ResponseLimits, widening
+from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, Band, ResponseLimits
 from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.errors import ConfigurationError, IdentificationError, Notice
@@ -87,10 +87,11 @@ def identify_samples(
         raise ConfigurationError("estimation.unknown_hold", hold=hold, known=HOLDS)
     records = [_checked(record) for record in records]
     choice = choose_sampled(records, hold, order=order, max_delay=max_delay)
-    sections = _sections(choice.chosen, period)
+    fitted = choice.chosen.fit
+    sections = fitted.model(period, fitted.problem.covariance(fitted, period))
     longest = max(len(record) for record in records)
     frequency = np.geomspace(1, longest / 2 - 1, _FREQUENCIES) / (longest * period)
-    sections, factor = _inflated_to_free_choice(sections, choice, frequency)
+    sections, factor = _inflated(sections, choice, frequency)
     blocks = _blocks(choice.chosen, period)
     corrected = sections.response(frequency) + _missed(choice.chosen, frequency * period)
     others = [other.response(frequency * period) for other in choice.alternatives]
@@ -150,24 +151,28 @@ def _checked(record: SampledRecord) -> SampledRecord:
     return replace(record, used=used)
 
 
-def _sections(candidate: SampledCandidate, period: float) -> ParallelSections:
-    fitted = candidate.fit
-    return fitted.model(period, fitted.problem.covariance(fitted, period))
-
-
-def _inflated_to_free_choice(
+def _inflated(
     sections: ParallelSections, choice: SampledChoice, lines: FloatArray
 ) -> tuple[ParallelSections, float]:
-    if choice.chosen is choice.free:
-        return sections, 1.0
-    free, factor = _sections(choice.free, sections.period), 1.0
+    """Return ``sections`` with the uncertainty that the choice of the order adds, and its factor.
+
+    The squares of the differences of all orders, weighted by their evidence (Burnham and Anderson
+    2002, ch. 4), add to the variance: by one factor, their geometric mean over the known lines.
+    """
+    responses = np.array([other.response(lines * sections.period) for other in choice.others])
+    own = [other.order for other in choice.others].index(choice.chosen.fit.order)
     with np.errstate(divide="ignore", invalid="ignore"):
-        apart = np.log(free.response(lines) / sections.response(lines))
-        for input in range(sections.inputs):
-            low, high = _widest(lines, _narrow(sections.band(lines, input)))
-            trusted = (lines >= low) & (lines <= high) & np.isfinite(apart[input])
-            own, other = (each.band(lines[trusted], input) for each in (sections, free))
-            factor = max(factor, widening(own, other, apart[input][trusted]))
+        apart = np.log(responses / responses[own])
+    # The lowest line of the part of the record on which orders were compared.
+    lowest, parts = lines[0] / np.sum(choice.evidence), [np.zeros(1)]
+    for input in range(sections.inputs):
+        band = sections.band(lines, input)
+        low, high = _widest(lines, _narrow(band))
+        known = (lines >= max(low, lowest)) & (lines <= high)
+        for off, spread in ((apart.real, band.gain), (apart.imag, band.phase)):
+            ratio = choice.evidence @ off[:, input] ** 2 / spread**2
+            parts.append(np.log1p(ratio[known & np.isfinite(ratio)]))
+    factor = float(np.exp(0.5 * np.mean(np.concatenate(parts))))
     return replace(sections, covariance=factor**2 * np.asarray(sections.covariance)), factor
 
 
@@ -329,7 +334,7 @@ def _entries(
         "residual_rms": float(np.sqrt(np.mean(residual**2))),
         "explained": 1 - float(np.mean(residual**2)) / variance,
         "predicted": 1 - float(np.mean(chosen.held_out)),
-        "impulse_response": {"comparator": choice.comparator, "model": choice.compared},
+        "impulse_response": choice.impulse_response,
         "whiteness_p": whiteness(residual),
         "independence_p": _independence(chosen),
         "poles": _poles(sections, valid),
@@ -382,7 +387,7 @@ def sampled_certificate(
     """Return JSON values, ending with ``reasons``, ``warnings`` and ``verdict``.
 
     order, free_order: number of poles of the model, and of the free choice
-    widened: factor on its uncertainties, for an order that was asked for
+    widened: factor on its uncertainties, for the choice of the order
     valid: range [Hz] within the limits, for each input
     worse: an impulse response predicts held-out samples better
     entries: with "predicted", the share of the variance of held-out parts that free runs explain
@@ -399,9 +404,15 @@ def sampled_certificate(
     if not all(high > low for low, high in valid):
         reasons.append(Notice("estimation.unknown_response", gain=limits.gain, phase=limits.phase))
     low, high = max(v[0] for v in valid), min(v[1] for v in valid)
-    accepted = Notice("estimation.accepted", low=low, high=high)
+    accepted, warnings = Notice("estimation.accepted", low=low, high=high), []
     if not high > low:
         accepted = Notice("estimation.accepted_apart")
+    if (independent := entries.get("independence_p", 1.0)) < _LEAST_INDEPENDENCE_P:
+        warnings.append(Notice("estimation.residual_follows_input", p=independent))
+    if order != free_order:
+        warnings.append(
+            Notice("estimation.order_differs", order=order, free=free_order, factor=widened)
+        )
     return {
         "order": order,
         "free_order": free_order,
@@ -411,18 +422,7 @@ def sampled_certificate(
             "phase_rad": limits.phase,
             "predicted_least": _LEAST_PREDICTED,
         },
-        "warnings": _warnings(entries.get("independence_p"), order, free_order, widened),
+        "warnings": [str(warning) for warning in warnings],
         "reasons": [str(reason) for reason in reasons],
         "verdict": REJECTED if reasons else str(accepted),
     }
-
-
-def _warnings(independent: object, order: int, free_order: int, widened: float) -> list[str]:
-    warnings = []
-    if isinstance(independent, float) and independent < _LEAST_INDEPENDENCE_P:
-        warnings.append(Notice("estimation.residual_follows_input", p=independent))
-    if order != free_order:
-        warnings.append(
-            Notice("estimation.order_differs", order=order, free=free_order, factor=widened)
-        )
-    return [str(warning) for warning in warnings]
