@@ -10,7 +10,7 @@ import numpy as np
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.ripple.density import Density, density
 from omsm_ros.core.ripple.lines import find_lines
-from omsm_ros.core.ripple.scan_signal import ScanSignal
+from omsm_ros.core.ripple.scan_signal import LEAST_POINTS, ScanSignal
 from omsm_ros.core.streams.blocks import SAME_PERIOD, AccelerationBlock, FloatArray, uninterrupted
 from omsm_ros.errors import ConfigurationError, DataError
 
@@ -18,8 +18,9 @@ AXES = ("x", "y", "z")
 PROBE, SLIDE = "probe", "carriage"
 """Mount of the accelerometer: on the probe, not measured by the encoder, or on the slide."""
 
-# Fewest samples for an estimate of the noise floor.
-_LEAST_SAMPLES = 256
+LARGEST_GAIN = 30.0
+"""Largest ratio of a line in the heights to the motion a/ω² that causes it, and of that to it."""
+
 # A line is spread over ±4 resolutions by the window; four times as many make a band.
 _LEAST_RESOLUTIONS = 16
 _LOBE = 4
@@ -73,8 +74,8 @@ def accelerations_of(blocks: Sequence[AccelerationBlock]) -> tuple[float, dict[s
         raise DataError("ripple.acceleration_periods", periods=sorted(periods))
     run = max(uninterrupted(blocks), key=lambda run: sum(map(len, run)))
     axes = {axis: np.concatenate([getattr(b, axis) for b in run]) for axis in AXES}
-    if len(axes["z"]) < _LEAST_SAMPLES:
-        raise DataError("ripple.short_acceleration", samples=len(axes["z"]), least=_LEAST_SAMPLES)
+    if len(axes["z"]) < LEAST_POINTS:
+        raise DataError("ripple.short_acceleration", samples=len(axes["z"]), least=LEAST_POINTS)
     return min(periods), axes
 
 
@@ -97,7 +98,7 @@ def acceleration_lines(period: float, axes: dict[str, FloatArray]) -> Accelerati
 
 def _lines(period: float, axis: str, values: FloatArray) -> list[AccelerationLine]:
     known = np.flatnonzero(np.isfinite(values))
-    if len(known) < _LEAST_SAMPLES or not np.ptp(values[known]):
+    if len(known) < LEAST_POINTS or not np.ptp(values[known]):
         return []
     still = np.zeros(len(known))
     signal = ScanSignal(

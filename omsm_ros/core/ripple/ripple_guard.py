@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from omsm_ros.core.ripple.accelerometer import AccelerationLine, AccelerationLines
+from omsm_ros.core.ripple.accelerometer import LARGEST_GAIN, AccelerationLine, AccelerationLines
 from omsm_ros.core.ripple.coordinates import Coordinate
 from omsm_ros.core.ripple.density import aliased_frequency, significance
 from omsm_ros.core.ripple.form_removal import FormFit, FormRemoved, SpindleOrder
@@ -20,6 +20,7 @@ from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TIME, TURN, ScanSigna
 from omsm_ros.core.ripple.source_hypotheses import (
     ALIASED,
     ARTEFACT,
+    GREATEST_CHANCE,
     PART,
     SYNCHRONOUS,
     UNDECIDED,
@@ -41,16 +42,12 @@ from omsm_ros.errors import Notice
 
 # Relative change of pace that moves a line of fifty waves by one; a smaller one decides nothing.
 _SAME_PACE = 0.02
-# Limits of the amplitude of a line over a/ω² of the acceleration that causes it.
-_LEAST_AMPLITUDE_RATIO, _GREATEST_AMPLITUDE_RATIO = 0.1, 30.0
 # Uncertainty of the frequency of an order, in resolutions.
 _OF_AN_ORDER = 0.25
 # Distance in resolutions below which a line and an order are not fitted separately.
 _LEAKS_BINS = 1.5
 # The first pass corrects the frequencies of the lines, the second their amplitudes.
 _TURNS_OF_FITTING = 2
-# Expected number of chance coincidences with acceleration lines that is accepted.
-_GREATEST_CHANCE = 0.1
 
 
 def missing_evidence(
@@ -246,18 +243,19 @@ def _named(done: Attribution, key: Key, evidence: LineEvidence) -> NamedLine:
 def _by_other_scans(done: Attribution, key: Key, source: SourceHypothesis) -> NamedLine:
     scans, line = done.scans, done.evidence[key].line
     names = [scans[own].signal.name for own, _ in source.partners]
-    h = source.hypothesis
     if source.kind == PART:
         code = "ripple.same_wavelength_on_path"
-        if h.coordinate == RADIUS:
+        if source.coordinate == RADIUS:
             code = "ripple.same_wavelength_on_radius"
         text = Notice(code, scans=names)
-        return NamedLine(line=line, kind=PART, evidence=(text,), wavelength=1 / h.frequency)
+        return NamedLine(line=line, kind=PART, evidence=(text,), wavelength=1 / source.frequency)
     if source.kind == ARTEFACT:
-        text = Notice("ripple.aliased_texture", scans=names, wavelength=1 / h.frequency)
-        return NamedLine(line=line, kind=ARTEFACT, evidence=(text,), wavelength=1 / h.frequency)
+        text = Notice("ripple.aliased_texture", scans=names, wavelength=1 / source.frequency)
+        return NamedLine(
+            line=line, kind=ARTEFACT, evidence=(text,), wavelength=1 / source.frequency
+        )
     if source.kind == SYNCHRONOUS:
-        order = round(h.frequency)
+        order = round(source.frequency)
         texts = [Notice("ripple.same_order", order=order, scans=names)]
         if scans[key[0]].formless.on_circle:
             texts.append(Notice("ripple.order_or_form_on_circle"))
@@ -268,16 +266,16 @@ def _by_other_scans(done: Attribution, key: Key, source: SourceHypothesis) -> Na
 def _vibration_in_other_scans(
     done: Attribution, key: Key, source: SourceHypothesis, names: list[str]
 ) -> NamedLine:
-    scans, line, h = done.scans, done.evidence[key].line, source.hypothesis
+    scans, line, frequency = done.scans, done.evidence[key].line, source.frequency
     rate = scans[key[0]].signal.rate
     rates = {round(scans[own].signal.rate, 6) for own, _ in source.partners} - {round(rate, 6)}
     if not rates:
         text = Notice("ripple.same_frequency", scans=names)
         return NamedLine(line=line, kind=VIBRATION, evidence=(text, _or_alias(line, rate)))
     sampled = [Notice("ripple.rate", rate=r) for r in sorted(rates)]
-    text = Notice("ripple.other_rates", scans=names, rates=sampled, frequency=h.frequency)
+    text = Notice("ripple.other_rates", scans=names, rates=sampled, frequency=frequency)
     return NamedLine(
-        line=line, kind=_vibration(h.frequency, rate), evidence=(text,), frequency=h.frequency
+        line=line, kind=_vibration(frequency, rate), evidence=(text,), frequency=frequency
     )
 
 
@@ -296,14 +294,14 @@ def _matching_acceleration_line(scan: StudiedScan, line: SpectralLine) -> Accele
         return None
     seen, rate = line.possible[TIME], scan.signal.rate
     tolerance = 1 / scan.signal.duration
-    if len(scan.acceleration_lines.lines) * 4 * tolerance / rate > _GREATEST_CHANCE:
+    if len(scan.acceleration_lines.lines) * 4 * tolerance / rate > GREATEST_CHANCE:
         tolerance /= 4
     near = [
         one
         for one in scan.acceleration_lines.lines
         if abs(float(aliased_frequency(one.frequency, rate)) - seen)
         <= tolerance + 4 * one.frequency_uncertainty
-        and _LEAST_AMPLITUDE_RATIO <= one.displacement / line.amplitude <= _GREATEST_AMPLITUDE_RATIO
+        and 1 / LARGEST_GAIN <= one.displacement / line.amplitude <= LARGEST_GAIN
     ]
     return min(near, key=lambda one: abs(np.log(one.displacement / line.amplitude)), default=None)
 

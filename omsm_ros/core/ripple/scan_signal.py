@@ -11,8 +11,9 @@ from omsm_ros.errors import DataError
 
 TIME, PATH, RADIUS, TURN = "time", "path", "radius", "turn"
 
-# Fewest points for an estimate of the noise floor.
-_LEAST_POINTS = 256
+LEAST_POINTS = 256
+"""Fewest readings for an estimate of the noise floor."""
+
 # A smaller rotation is noise of the spindle encoder [turns].
 _LEAST_TURN = 0.01
 # Parts of a scan over which feed and speed are constant, to average encoder noise.
@@ -81,21 +82,21 @@ def scan_signal(
     sample, height = _longest_run(*readings)
     count, x, y, c = _longest_run(*axes)
     known = np.isfinite(x) & np.isfinite(y) & np.isfinite(c)
-    if len(sample) < _LEAST_POINTS or np.count_nonzero(known) < _LEAST_POINTS:
+    if len(sample) < LEAST_POINTS or np.count_nonzero(known) < LEAST_POINTS:
         raise DataError(
             "ripple.short_scan",
             name=name,
             readings=len(sample),
             positions=int(np.count_nonzero(known)),
-            least=_LEAST_POINTS,
+            least=LEAST_POINTS,
         )
     count, x, y, c = (values[known] for values in (count, x, y, c))
     turn = unwrapped_angle(count, c) / (2 * np.pi)
     inside = (sample >= count[0]) & (sample <= count[-1])
     sample, height = sample[inside], height[inside]
-    if len(sample) < _LEAST_POINTS:
+    if len(sample) < LEAST_POINTS:
         raise DataError(
-            "ripple.disjoint_counts", name=name, readings=len(sample), least=_LEAST_POINTS
+            "ripple.disjoint_counts", name=name, readings=len(sample), least=LEAST_POINTS
         )
     # The period is that of the readings, or a line would have an alias below half the rate.
     every = int(np.gcd.reduce(np.diff(sample)))

@@ -35,8 +35,9 @@ _MOST_ALIASES = 5
 _STEADY = {TIME: 2e-4, PATH: 1e-4, RADIUS: 1e-4, TURN: 1e-5}
 # Tolerance of a frequency: standard uncertainties, and parts of a resolution for window and fit.
 _TIMES_UNCERTAINTY, _OWN_BIN, _OTHER_BIN = 4.0, 0.3, 0.1
-# Largest expected number of chance coincidences within a tolerance.
-_GREATEST_CHANCE = 0.1
+GREATEST_CHANCE = 0.1
+"""Largest expected number of chance coincidences within a tolerance."""
+
 # Expected amplitude over its σ from which a line that is not found is absent.
 _DETECTION_RATIO = 9.0
 # Largest ratio of the amplitudes of one line in two scans.
@@ -75,12 +76,17 @@ class StudiedScan:
         return self.coordinates[coordinate].resolution
 
 
+Key = tuple[int, int]
+"""Index of a scan, and of a line in it."""
+
+
 @dataclass(frozen=True, slots=True)
-class Hypothesis:
+class SourceHypothesis:
     """Hypothesis that a line is of a ``kind``, with a true ``frequency`` over ``coordinate``.
 
     uncertainty: of that frequency, including the resolution of the scan
     alias_count: zone of the alias of a vibration, 0 below half the sampling rate
+    partners: lines of other scans that support it;  absent: scans in which it is missing
     """
 
     kind: str
@@ -88,6 +94,13 @@ class Hypothesis:
     frequency: float
     uncertainty: float
     alias_count: int = 0
+    partners: tuple[Key, ...] = ()
+    absent: tuple[int, ...] = ()
+
+    @property
+    def alive(self) -> bool:
+        """False if it is missing in a scan; a vibration may be missing."""
+        return self.kind == VIBRATION or not self.absent
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,21 +116,21 @@ class ExpectedLine:
     aliased: bool
 
 
-def hypotheses_of(scan: StudiedScan, line: SpectralLine) -> Iterator[Hypothesis]:
+def hypotheses_of(scan: StudiedScan, line: SpectralLine) -> Iterator[SourceHypothesis]:
     """Yield the hypotheses for a ``line`` of ``scan``, including vibrations with this alias."""
     if TIME in line.possible:
         seen, spread = line.possible[TIME], spread_of(scan, line, TIME)
         rate = scan.signal.rate
-        yield Hypothesis(VIBRATION, TIME, seen, spread)
+        yield SourceHypothesis(VIBRATION, TIME, seen, spread)
         for alias_count in range(1, _MOST_ALIASES + 1):
             for image in (alias_count * rate - seen, alias_count * rate + seen):
-                yield Hypothesis(VIBRATION, TIME, image, spread, alias_count)
+                yield SourceHypothesis(VIBRATION, TIME, image, spread, alias_count)
     for coordinate in (PATH, RADIUS):
         if coordinate in line.possible:
             spread = spread_of(scan, line, coordinate)
-            yield Hypothesis(PART, coordinate, line.possible[coordinate], spread)
+            yield SourceHypothesis(PART, coordinate, line.possible[coordinate], spread)
     if (order := whole_order(scan, line)) is not None:
-        yield Hypothesis(SYNCHRONOUS, TURN, float(order), 0.0)
+        yield SourceHypothesis(SYNCHRONOUS, TURN, float(order), 0.0)
 
 
 def whole_order(scan: StudiedScan, line: SpectralLine) -> int | None:
@@ -147,7 +160,7 @@ def _own_uncertainty(scan: StudiedScan, line: SpectralLine, coordinate: str) -> 
     return line.frequency_uncertainty * share
 
 
-def place_in(scan: StudiedScan, hypothesis: Hypothesis) -> ExpectedLine | None:
+def place_in(scan: StudiedScan, hypothesis: SourceHypothesis) -> ExpectedLine | None:
     """Return where the line is expected in ``scan``, None if the scan cannot show it."""
     coordinate = scan.coordinates.get(hypothesis.coordinate)
     if coordinate is None:
@@ -189,10 +202,10 @@ def chance_probability(scan: StudiedScan, place: ExpectedLine) -> float:
     return count * 2 * place.tolerance / band
 
 
-def is_detected(scan: StudiedScan, hypothesis: Hypothesis, amplitude: float) -> bool | None:
+def is_detected(scan: StudiedScan, hypothesis: SourceHypothesis, amplitude: float) -> bool | None:
     """Return whether ``scan`` shows a line of ``amplitude`` [m], None if it cannot decide."""
     place = place_in(scan, hypothesis)
-    if place is None or chance_probability(scan, place) > _GREATEST_CHANCE:
+    if place is None or chance_probability(scan, place) > GREATEST_CHANCE:
         return None
     line = lines_at(scan, place)
     if line is not None:
@@ -206,7 +219,7 @@ def is_detected(scan: StudiedScan, hypothesis: Hypothesis, amplitude: float) -> 
 
 
 def _may_be_masked(
-    scan: StudiedScan, hypothesis: Hypothesis, place: ExpectedLine, amplitude: float
+    scan: StudiedScan, hypothesis: SourceHypothesis, place: ExpectedLine, amplitude: float
 ) -> bool:
     if hypothesis.kind == VIBRATION:
         return False  # a vibration may stop, so that its absence is never used as evidence
@@ -233,32 +246,10 @@ def _near_form(scan: StudiedScan, place: ExpectedLine) -> bool:
     )
 
 
-def _least_share(scan: StudiedScan, hypothesis: Hypothesis) -> float:
+def _least_share(scan: StudiedScan, hypothesis: SourceHypothesis) -> float:
     """Return the attenuation of a texture by averaging over a sample period."""
     coordinate = scan.coordinates[hypothesis.coordinate]
     return float(abs(np.sinc(hypothesis.frequency * coordinate.pace * scan.signal.period)))
-
-
-Key = tuple[int, int]
-"""Index of a scan, and of a line in it."""
-
-
-@dataclass(frozen=True, slots=True)
-class SourceHypothesis:
-    """Source of a line: ``partners`` support it; it is missing in the scans ``absent``.
-
-    kind: that of the hypothesis, or ARTEFACT
-    """
-
-    kind: str
-    hypothesis: Hypothesis
-    partners: tuple[Key, ...]
-    absent: tuple[int, ...] = ()
-
-    @property
-    def alive(self) -> bool:
-        """False if it is missing in a scan; a vibration may be missing."""
-        return self.kind == VIBRATION or not self.absent
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,7 +293,7 @@ def _tests(scans: Sequence[StudiedScan], key: Key) -> Iterator[SourceHypothesis]
                     present.append((other, index))
             elif shown is not None:
                 absent.append(other)
-        yield SourceHypothesis(hypothesis.kind, hypothesis, tuple(present), tuple(absent))
+        yield replace(hypothesis, partners=tuple(present), absent=tuple(absent))
 
 
 def _same_part(one: StudiedScan, other: StudiedScan) -> bool:
@@ -322,8 +313,8 @@ def _sources(
         decisive = tuple(
             key
             for key in one.partners
-            for place in [place_in(scans[key[0]], one.hypothesis)]
-            if all(apart(place, place_in(scans[key[0]], r.hypothesis)) for r in rivals)
+            for place in [place_in(scans[key[0]], one)]
+            if all(apart(place, place_in(scans[key[0]], r)) for r in rivals)
         )
         if decisive:
             found.append(replace(one, partners=decisive))
@@ -332,9 +323,9 @@ def _sources(
 
 def _is_rival(one: SourceHypothesis, other: SourceHypothesis) -> bool:
     """Return True for another kind that needs no aliasing."""
-    if one.kind == SYNCHRONOUS and other.hypothesis.coordinate == PATH:
+    if one.kind == SYNCHRONOUS and other.coordinate == PATH:
         return False  # on circles of one radius form of the part repeats in the same way
-    return one.kind != other.kind and not other.hypothesis.alias_count
+    return one.kind != other.kind and not other.alias_count
 
 
 def _least_aliased(found: list[SourceHypothesis]) -> list[SourceHypothesis]:
@@ -342,7 +333,7 @@ def _least_aliased(found: list[SourceHypothesis]) -> list[SourceHypothesis]:
     shaken = [c for c in found if c.kind == VIBRATION]
     if not shaken:
         return found
-    best = min(shaken, key=lambda c: (-len(c.partners), c.hypothesis.frequency))
+    best = min(shaken, key=lambda c: (-len(c.partners), c.frequency))
     return [c for c in found if c.kind != VIBRATION] + [best]
 
 
@@ -353,12 +344,12 @@ def _images(
     found: dict[Key, list[SourceHypothesis]] = {}
     for key, own in sources.items():
         for texture in own:
-            if texture.kind != PART or texture.hypothesis.coordinate != PATH:
+            if texture.kind != PART or texture.coordinate != PATH:
                 continue
             for partner in texture.partners:
-                place = place_in(scans[partner[0]], texture.hypothesis)
+                place = place_in(scans[partner[0]], texture)
                 if place is not None and place.aliased and place.coordinate == TIME:
-                    image = SourceHypothesis(ARTEFACT, texture.hypothesis, (key,))
+                    image = replace(texture, kind=ARTEFACT, partners=(key,))
                     found.setdefault(partner, []).append(image)
     return found
 
@@ -472,5 +463,5 @@ def _family(kind: str) -> str:
 
 def is_ring_or_spindle(tested: Sequence[SourceHypothesis]) -> bool:
     """Return True if partners support both rings on the part and a spindle error."""
-    kinds = {(t.kind, t.hypothesis.coordinate) for t in tested if t.alive and t.partners}
+    kinds = {(t.kind, t.coordinate) for t in tested if t.alive and t.partners}
     return (PART, RADIUS) in kinds and any(kind == SYNCHRONOUS for kind, _ in kinds)

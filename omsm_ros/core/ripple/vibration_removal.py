@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from omsm_ros.core.lti.transfer_function import ComplexArray
-from omsm_ros.core.ripple.coordinates import magnitudes
+from omsm_ros.core.ripple.accelerometer import LARGEST_GAIN
+from omsm_ros.core.ripple.coordinates import LEAST_WAVES, magnitudes
 from omsm_ros.core.ripple.density import aliased_frequency, significance
 from omsm_ros.core.ripple.form_removal import HIGHEST_ORDER
 from omsm_ros.core.ripple.scan_signal import TIME, TURN
@@ -30,10 +31,8 @@ _LEAST_SIGMA = 4.0
 _OVER_FLOOR, _MODULATION_HZ, _WIDEST_HZ = 9.0, 1.0, 20.0
 # Greatest difference of two quartz clocks.
 _CLOCKS = 200e-6
-# Waves of a scan below which a line is like form; resolutions about a line that are near it.
-_LEAST_WAVES, _NEAR = 4, 4.0
-# Limits of the height over the motion a/ω² of the accelerometer.
-_LEAST_GAIN, _GREATEST_GAIN = 0.05, 30.0
+# Resolutions about a line that are near it.
+_NEAR = 4.0
 REMOVED, NOT_IN_HEIGHTS, FORM = "removed", "not_in_heights", "like_form"
 
 
@@ -123,7 +122,7 @@ def _other_lines(scan: StudiedScan) -> FloatArray:
 def _other_source(scan: StudiedScan, frequency: float, seen: float) -> str:
     """Return FORM if heights at this frequency may be form of the part, else ""."""
     turn = scan.coordinates.get(TURN)
-    near = _LEAST_WAVES * scan.resolution(TIME)
+    near = LEAST_WAVES * scan.resolution(TIME)
     for place in (frequency, seen):
         if turn is not None and place < (HIGHEST_ORDER + 0.5) * turn.pace:
             return FORM
@@ -174,7 +173,7 @@ def _fitted(
     amplitude, sigma = float(np.hypot(*solution)) * size, scan.spectrum.sigma_at(seen)
     sure = float(significance(np.array(amplitude**2 / (2 * sigma**2)), tried))
     gain = amplitude / size
-    is_there = sure >= _LEAST_SIGMA and _LEAST_GAIN <= gain <= _GREATEST_GAIN
+    is_there = sure >= _LEAST_SIGMA and 1 / LARGEST_GAIN <= gain <= LARGEST_GAIN
     # A match that is best beyond the search is the side lobe of another line.
     is_there &= clock is not None or abs(shift) <= _CLOCKS * frequency + scan.resolution(TIME) / 2
     left = heights - removed if is_there else heights

@@ -13,7 +13,7 @@ from omsm_ros.core.ripple.source_hypotheses import (
     SYNCHRONOUS,
     VIBRATION,
     ExpectedLine,
-    Hypothesis,
+    SourceHypothesis,
     apart,
     chance_probability,
     hypotheses_of,
@@ -83,7 +83,7 @@ class TestPlaces:
     @settings(max_examples=50)
     @given(st.floats(1.0, 1e5), st.floats(0.001, 0.2), st.floats(200.0, 5000.0))
     def test_a_texture_of_an_even_scan_is_where_its_frequency_folds(self, waves, pace, rate):
-        place = place_in(scan(rate, pace), Hypothesis(PART, PATH, waves, 0.0))
+        place = place_in(scan(rate, pace), SourceHypothesis(PART, PATH, waves, 0.0))
         assert place.coordinate == TIME
         assert place.frequency == pytest.approx(aliased(waves * pace, rate), abs=1e-6 * rate)
         assert place.aliased == (waves * pace > rate / 2)
@@ -99,20 +99,20 @@ class TestPlaces:
         ],
     )
     def test_vibration_order_and_rings_too(self, kind, coordinate, frequency, seen):
-        place = place_in(scan(), Hypothesis(kind, coordinate, frequency, 0.0))
+        place = place_in(scan(), SourceHypothesis(kind, coordinate, frequency, 0.0))
         assert place.frequency == pytest.approx(seen)
         assert place.aliased == (frequency > 500.0 and coordinate == TIME)
 
     def test_where_the_pace_changes_it_stays_in_its_coordinate(self):
         curved = scan(path_like=PATH)
-        place = place_in(curved, Hypothesis(PART, PATH, 3000.0, 2.0))
+        place = place_in(curved, SourceHypothesis(PART, PATH, 3000.0, 2.0))
         assert (place.coordinate, place.frequency, place.aliased) == (PATH, 3000.0, False)
         assert place.tolerance == pytest.approx(2.0 + 0.3 / 0.8)
-        assert place_in(curved, Hypothesis(PART, PATH, 13_000.0, 2.0)).aliased
+        assert place_in(curved, SourceHypothesis(PART, PATH, 13_000.0, 2.0)).aliased
 
     def test_what_is_uncertain_on_the_part_is_so_in_time(self):
         sure, unsure = (
-            place_in(scan(), Hypothesis(PART, PATH, 3000.0, spread)) for spread in (0.0, 10.0)
+            place_in(scan(), SourceHypothesis(PART, PATH, 3000.0, spread)) for spread in (0.0, 10.0)
         )
         assert unsure.tolerance - sure.tolerance == pytest.approx(10.0 * 0.04)
         assert sure.tolerance == pytest.approx(0.3 / 20.0)
@@ -120,8 +120,8 @@ class TestPlaces:
     def test_a_scan_that_does_not_move_there_shows_nothing(self):
         still = scan()
         del still.coordinates[RADIUS]
-        assert place_in(still, Hypothesis(PART, RADIUS, 1e4, 0.0)) is None
-        assert is_detected(still, Hypothesis(PART, RADIUS, 1e4, 0.0), NM) is None
+        assert place_in(still, SourceHypothesis(PART, RADIUS, 1e4, 0.0)) is None
+        assert is_detected(still, SourceHypothesis(PART, RADIUS, 1e4, 0.0), NM) is None
 
     def test_two_places_are_apart_beyond_what_both_leave_open(self):
         one = ExpectedLine(TIME, 100.0, 0.2, False)
@@ -151,8 +151,8 @@ class TestWhatIsThere:
             2 * 0.5 / 500
         )
 
-    HUM = Hypothesis(VIBRATION, TIME, 100.0, 0.0)
-    MARKS = Hypothesis(PART, PATH, 2500.0, 0.0)  # 100 Hz at 40 mm/s
+    HUM = SourceHypothesis(VIBRATION, TIME, 100.0, 0.0)
+    MARKS = SourceHypothesis(PART, PATH, 2500.0, 0.0)  # 100 Hz at 40 mm/s
 
     def test_the_same_line_may_be_a_few_times_as_strong_and_else_nothing_is_known(self):
         there = scan(lines=[line(100.0, 5 * NM)])
@@ -166,9 +166,9 @@ class TestWhatIsThere:
         assert is_detected(scan(), self.MARKS, 5 * NM) is False
         assert is_detected(scan(sigma=1 * NM), self.MARKS, 5 * NM) is None
         assert (
-            is_detected(scan(), Hypothesis(PART, PATH, 2.5, 0.0), 5 * NM) is None
+            is_detected(scan(), SourceHypothesis(PART, PATH, 2.5, 0.0), 5 * NM) is None
         )  # 2 waves: form
-        at_an_order = Hypothesis(PART, PATH, 3.5 / 0.04, 0.0)  # 7 waves a turn
+        at_an_order = SourceHypothesis(PART, PATH, 3.5 / 0.04, 0.0)  # 7 waves a turn
         assert is_detected(scan(), at_an_order, 5 * NM) is None
 
     def test_a_vibration_is_never_absent_for_a_machine_may_stand_still(self):
@@ -176,7 +176,7 @@ class TestWhatIsThere:
 
     def test_a_fine_texture_is_averaged_away_over_a_sample(self):
         """At a wave a sample nothing of it is left, so that nothing is no evidence."""
-        fine = Hypothesis(PART, PATH, 1000.0 / 0.04 * 1.13, 0.0)
+        fine = SourceHypothesis(PART, PATH, 1000.0 / 0.04 * 1.13, 0.0)
         share = abs(np.sinc(1.13))
         assert is_detected(scan(sigma=share * 5 * NM / 8.9), fine, 5 * NM) is None
         assert is_detected(scan(sigma=share * 5 * NM / 9.1), fine, 5 * NM) is False
@@ -184,7 +184,7 @@ class TestWhatIsThere:
         assert is_detected(weak, fine, 5 * NM) is True
 
     def test_an_expected_line_as_broad_as_the_band_gives_no_evidence(self):
-        broad = Hypothesis(PART, PATH, 2500.0, 1000.0)
+        broad = SourceHypothesis(PART, PATH, 2500.0, 1000.0)
         assert is_detected(scan(lines=[line(300.0)]), broad, 5 * NM) is None
 
     def test_where_the_pace_changes_a_texture_is_missed_by_the_noise_of_all_samples(self):
@@ -193,4 +193,4 @@ class TestWhatIsThere:
         assert is_detected(curved, self.MARKS, 8.9 * sigma) is None
         # Averaged over a sample a tenth of its wave goes by: 1.6 % less is left.
         assert is_detected(curved, self.MARKS, 9.3 * sigma) is False
-        assert is_detected(curved, Hypothesis(PART, PATH, 13_000.0, 0.0), 9.0) is None
+        assert is_detected(curved, SourceHypothesis(PART, PATH, 13_000.0, 0.0), 9.0) is None
