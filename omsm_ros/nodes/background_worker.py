@@ -13,7 +13,7 @@ from rclpy.task import Future
 
 from omsm_ros.errors import OmsmError
 from omsm_ros.nodes.memory import return_free_memory
-from omsm_ros.nodes.running import offer, refusing
+from omsm_ros.nodes.running import refusing
 from omsm_ros.nodes.topics import REQUESTS_QOS, every
 
 T = TypeVar("T")
@@ -91,7 +91,7 @@ def serve_action(
 
 
 class BackgroundWorker:
-    """A thread for the work of a node, and services that await it without stopping the node."""
+    """A thread for the work of a node; services await it without stopping the node."""
 
     def __init__(self, node: Node, undo: ExitStack) -> None:
         self._node = node
@@ -125,18 +125,6 @@ class BackgroundWorker:
                 return await done  # type: ignore[no-any-return]
             finally:
                 self.waiting -= 1
-
-    def serve(
-        self, undo: ExitStack, kind: Any, name: str, answer: Callable[[Any, Any], Awaitable[None]]
-    ) -> None:
-        """Offer the service ``name``, as ``running.serve``, with an asynchronous ``answer``."""
-
-        async def callback(request: Any, response: Any) -> Any:
-            with refusing(self._node, response):
-                await answer(request, response)
-            return response
-
-        offer(self._node, undo, kind, name, callback)
 
     def _run(self) -> None:
         patience: float | None = None

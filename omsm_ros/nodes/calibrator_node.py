@@ -34,7 +34,7 @@ from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import BAG_FOLDERS, TRIGGER, trigger_of
 from omsm_ros.nodes.diagnostics import WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
-from omsm_ros.nodes.running import run, settings_of
+from omsm_ros.nodes.running import run, serve, settings_of
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
 from omsm_ros.pipelines.history import record_in_catalogue
 from omsm_ros.quantities import Parameter
@@ -88,7 +88,7 @@ class CalibratorNode(ManagedNode):
             self.get_logger().error(self._trouble)
         self._topic = CalibrationTopic(self, undo, self._adopt, listens=True)
         self._worker = BackgroundWorker(self, undo)
-        self._worker.serve(undo, Identify, "~/identify", self._on_identify)
+        serve(self, undo, Identify, "~/identify", self._on_identify)
         serve_action(self, undo, action.Identify, "~/identify", self._on_identify)
         self._probe: dict[str, object] = {}
         listen(self, undo, String, "probe_settings", self._on_probe, LATCHED_BY_MANY_QOS)

@@ -36,7 +36,7 @@ from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, options_of, sources_of
 from omsm_ros.nodes.diagnostics import ERROR, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
-from omsm_ros.nodes.running import run, settings_of
+from omsm_ros.nodes.running import run, serve, settings_of
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, every, listen, take_rest
 from omsm_ros.pipelines.measure import live_verdict, with_sources
 from omsm_ros.report.verdict import next_steps
@@ -225,8 +225,8 @@ class CorrectorNode(ManagedNode):
         listen(self, undo, String, "probe_settings", self._on_probe, LATCHED_BY_MANY_QOS)
         topics.publish_frames(self, undo, self._options.geometry, self.values)
         self._worker = BackgroundWorker(self, undo)
-        self._worker.serve(undo, LoadCalibration, "~/load_calibration", self._on_load)
-        self._worker.serve(undo, PredictError, "~/predict_error", self._on_predict)
+        serve(self, undo, LoadCalibration, "~/load_calibration", self._on_load)
+        serve(self, undo, PredictError, "~/predict_error", self._on_predict)
         serve_action(self, undo, action.PredictError, "~/predict_error", self._on_predict)
         if path := self.values["calibration"]:
             self._put_in_force(load_calibration(path), since(Path(path)))

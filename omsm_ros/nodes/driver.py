@@ -33,7 +33,7 @@ from omsm_ros.io.figure_messages import probe_message
 from omsm_ros.nodes.background_worker import BackgroundWorker
 from omsm_ros.nodes.diagnostics import ERROR, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
-from omsm_ros.nodes.running import run
+from omsm_ros.nodes.running import run, serve
 from omsm_ros.nodes.topics import FRAME_PREFIX, LATCHED_QOS, publish_on
 from omsm_ros.quantities import Parameter
 
@@ -193,7 +193,7 @@ class ConfocalDriverNode(DriverNode):
         """Make the device, not yet connected, and answer requests."""
         super().configure(undo)
         self._worker = BackgroundWorker(self, undo)
-        self._worker.serve(undo, Trigger, "~/dark_reference", self._on_dark_reference)
+        serve(self, undo, Trigger, "~/dark_reference", self._on_dark_reference)
 
     async def _on_dark_reference(
         self, request: Trigger.Request, response: Trigger.Response

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -217,19 +217,24 @@ class PacedService(ReentrantCallbackGroup):  # type: ignore[misc]
 
 
 def serve(
-    node: Node, undo: ExitStack, kind: Any, name: str, answer: Callable[[Any, Any], None]
-) -> None:
-    """Offer the service ``name`` until ``undo``; ``answer`` fills in the response.
+    node: Node, undo: ExitStack, kind: Any, name: str,
+    answer: Callable[[Any, Any], Awaitable[None] | None],
+) -> None:  # fmt: skip
+    """Offer the service ``name`` until ``undo``; its requests are taken at a pace.
 
-    An exception of ``answer`` is answered as not successful (or not safe), with the reason.
+    answer: fills in the response, at once or asynchronously; an exception of it is answered as not
+        successful (or not safe), with the reason
     """
 
-    def callback(request: Any, response: Any) -> Any:
+    async def callback(request: Any, response: Any) -> Any:
         with refusing(node, response):
-            answer(request, response)
+            if (work := answer(request, response)) is not None:
+                await work
         return response
 
-    offer(node, undo, kind, name, callback)
+    group = PacedService(node, undo)
+    made = node.create_service(kind, name, callback, qos_profile=REQUESTS_QOS, callback_group=group)
+    undo.callback(node.destroy_service, made)
 
 
 @contextmanager
@@ -241,15 +246,6 @@ def refusing(node: Node, response: Any) -> Iterator[None]:
         refuse(response, str(err))
     except Exception as err:
         refuse(response, log_internal_error(node, err))
-
-
-def offer(
-    node: Node, undo: ExitStack, kind: Any, name: str, callback: Callable[[Any, Any], Any]
-) -> None:
-    """Create a service that takes its requests at a pace, until ``undo``."""
-    group = PacedService(node, undo)
-    made = node.create_service(kind, name, callback, qos_profile=REQUESTS_QOS, callback_group=group)
-    undo.callback(node.destroy_service, made)
 
 
 def refuse(response: Any, reason: str) -> None:

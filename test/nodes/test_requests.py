@@ -1,5 +1,6 @@
 """How nodes answer requests, take what waits, and tell what they have taken."""
 
+import asyncio
 import json
 from contextlib import ExitStack, nullcontext
 from types import SimpleNamespace
@@ -37,7 +38,7 @@ def served(answer):
     node = FakeNode("calibrator_of_requests")
     serve(node, ExitStack(), SetBool, "~/switch", answer)
     (service,) = node.services
-    return node, service.callback(SetBool.Request(data=True), SetBool.Response())
+    return node, asyncio.run(service.callback(SetBool.Request(data=True), SetBool.Response()))
 
 
 def test_an_answer_is_what_it_was_filled_with():
