@@ -30,12 +30,18 @@ TRIGGER = (
         quantities.STAMP_TOLERANCE,
     ),
 )
-BAG_FOLDERS = Parameter(
-    "bag_folders",
-    "~:.:/tmp",
-    "folders from which a service may read bags, separated by ':'; ~ = home, . = where the node "
-    "was started; empty = any folder",
-)
+
+
+def _folders(name: str, read: str) -> Parameter:
+    return Parameter(
+        name,
+        "~:.:/tmp",
+        f"folders from which {read}, separated by ':'; ~ = home, . = where the node was started; "
+        "empty = any folder",
+    )
+
+
+BAG_FOLDERS = _folders("bag_folders", "a service may read bags")
 
 
 def _numbers(prefix: str, record: type, text: str) -> list[Parameter]:
@@ -47,12 +53,7 @@ def _numbers(prefix: str, record: type, text: str) -> list[Parameter]:
 
 PARAMETERS = (
     Parameter("calibration", "", "calibration file to start with; empty = wait for one"),
-    Parameter(
-        "calibration_folders",
-        "~:.:/tmp",
-        "folders from which load_calibration may read, separated by ':'; ~ = home, . = where the "
-        "node was started; empty = any folder",
-    ),
+    _folders("calibration_folders", "load_calibration may read"),
     BAG_FOLDERS,
     Parameter("follow_calibrator", True, "use calibrations from the topic calibration"),
     Parameter("settings", "", "JSON object of the cell's settings; empty = not compared"),

@@ -337,11 +337,8 @@ class CorrectorNode(ManagedNode):
         if goal is not None or bag:
             predict = partial(in_child, predict, attend=goal.attend if goal else None)
         prediction = await self._worker.do(predict, goal)
-        response.peak_to_valley = prediction.peak_to_valley
-        response.rms = prediction.rms
-        response.outside_band_fraction = prediction.outside_band_fraction
-        response.safe = prediction.safe
-        response.message = prediction.message
+        for name in ("peak_to_valley", "rms", "outside_band_fraction", "safe", "message"):
+            setattr(response, name, getattr(prediction, name))
         if goal is not None:
             response.success = True
 
