@@ -194,7 +194,7 @@ _WRITTEN_SIZE = 8
 # At 1 kHz this gives twenty samples at a time, and a ring of a thousand holds a second [s].
 _POLL_S = 0.02
 # An answer that takes longer than this counts as lost, so that the driver connects again [s].
-_ANSWER_S = 1.0
+_ANSWER_S = 0.5
 _MOST_SAMPLES = 200_000
 
 
