@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.interface_calibration import Calibration
-from omsm_ros.interface_inputs import load
+from omsm_ros.interface_inputs import Calibration, load
 from omsm_ros.interface_inputs import read as read
 from omsm_ros.interface_inputs import simulate as simulate
 from omsm_ros.interface_inputs import surface as surface
