@@ -1,7 +1,8 @@
 """Figures of one map by prysm, SurfaceTopography and surfalize, in an environment of their own.
 
 Run by ``benchmarks.form`` with the Python of that environment: ``surface_peers.py MAP.npz``. Prints
-one JSON object of Sa, Sq, Sz [m], slope [1] and mean square in a band [m²] for each peer.
+one JSON object of Sa, Sq, Sz [m], Sdq [1] and mean square in a band [m²] for each peer. Both peers
+take Sdq from the differences of neighbouring points; prysm is given the window of the density.
 """
 
 import json
@@ -13,34 +14,34 @@ import numpy as np
 warnings.simplefilter("ignore")
 
 
-def surfalize(z, dx, dy, band):
+def surfalize(z, dx, dy, band, window):
     from surfalize import Surface
 
     made = Surface(z * 1e6, dx * 1e6, dy * 1e6)
-    return {n: getattr(made, n)() * 1e-6 for n in ("Sa", "Sq", "Sz")} | {"slope": made.Sdq()}
+    return {n: getattr(made, n)() * 1e-6 for n in ("Sa", "Sq", "Sz")} | {"Sdq": made.Sdq()}
 
 
-def topography(z, dx, dy, band):
+def topography(z, dx, dy, band, window):
     from SurfaceTopography import Topography
 
     made = Topography(z.T, (z.shape[1] * dx, z.shape[0] * dy))
-    return {"Sq": float(made.rms_height_from_area()), "slope": float(made.rms_gradient())}
+    return {"Sq": float(made.rms_height_from_area()), "Sdq": float(made.rms_gradient())}
 
 
-def prysm(z, dx, dy, band):
+def prysm(z, dx, dy, band, window):
     from prysm.interferogram import psd
 
     if abs(dx / dy - 1) > 1e-6:
         return {}  # it has square pixels only
-    fy, fx, density = _psd(psd, z, dx)
+    fy, fx, density = _psd(psd, z, dx, window)
     f = np.hypot(fx[np.newaxis], fy[:, np.newaxis])
     inside = (f >= band[0]) & (f <= band[1])
     cell = abs(fx[1] - fx[0]) * abs(fy[1] - fy[0])
     return {"in_band": float(np.sum(density[inside]) * cell)}
 
 
-def _psd(psd, z, dx):
-    found = psd(z - z.mean(), dx)
+def _psd(psd, z, dx, window):
+    found = psd(z - np.average(z, weights=window), dx, window)
     fx, fy, density = (np.asarray(part) for part in found)
     if fx.ndim == 2:
         fx, fy = fx[0], fy[:, 0]
@@ -49,7 +50,7 @@ def _psd(psd, z, dx):
 
 def main(path):
     content = np.load(path)
-    given = content["z"], float(content["dx"]), float(content["dy"]), content["band"]
+    given = content["z"], float(content["dx"]), float(content["dy"]), content["band"], content["window"]
     found = {}
     for peer in (surfalize, topography, prysm):
         try:

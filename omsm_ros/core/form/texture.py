@@ -146,7 +146,7 @@ def texture(
     points: DeviationMap | None = None,
     rest: GridCells | None = None,
 ) -> dict[str, UncertainValue]:
-    """Return Sa, Sq, Sz [m], Ssk, Sku [1] of the S-L surface, rms by band [m], slopes [1].
+    """Return Sa, Sq, Sz [m], Ssk, Sku, Sdq [1] of the S-L surface, rms by band [m], slopes [1].
 
     formless: the same cells after the F-operation
     points: the S-L surface, None for that of the cells
@@ -159,6 +159,10 @@ def texture(
     between = (bands.s_filter, bands.l_filter)
     surface = _band(formless, *between, levels) if points is None else _of_points(points)
     found = dict(zip(("Sa", "Sq", "Sz", "Ssk", "Sku"), surface.figures(_moments, 3), strict=True))
+    pairs = _band(formless, *between, levels, between=True)
+    found["Sdq"] = UncertainValue(None, None)
+    if pairs.levels[0].size:
+        found["Sdq"] = pairs.figures(lambda v: np.sqrt(np.mean(v * v, keepdims=True)), 1)[0]
     for name, (long, short) in bands.rms_bands.items():
         same = long and short in (None, bands.s_filter)
         band = _band(formless if long else cells, short, long, levels if same else None)
@@ -231,11 +235,17 @@ def _cutoffs(cells: GridCells, short: float | None) -> list[tuple[float, float]]
 
 
 def _band(
-    cells: GridCells, short: float | None, long: float | None, planes: _Planes | None = None
+    cells: GridCells,
+    short: float | None,
+    long: float | None,
+    planes: _Planes | None = None,
+    *,
+    between: bool = False,
 ) -> _FilteredBand:
     """Return the present cells between an S- and an L-filter (ISO 25178-2).
 
     planes: of their mean, if they are known
+    between: return the slopes between neighbouring cells instead
     """
     images, effects = np.concatenate([cells.mean[np.newaxis], _noise(cells)]), cells.effects
     if short is None and cells.width == 0:
@@ -249,9 +259,24 @@ def _band(
 
     def kept(images: FloatArray) -> FloatArray:
         rest = images if long is None else images - cells.smoothed(images, long)
-        return np.asarray(rest[:, cells.present])
+        return _between(cells, rest) if between else np.asarray(rest[:, cells.present])
 
     return _FilteredBand([*map(kept, levels)], kept(effects), cells.noise_known)
+
+
+def _between(cells: GridCells, images: FloatArray) -> FloatArray:
+    """Return the slopes (k, n) [1] of images (k, r, c) between neighbouring present cells.
+
+    They are weighted so that their mean square is the sum of the mean squares along x and y.
+    """
+    found = []
+    for axis, step in zip((-1, -2), cells.steps, strict=True):
+        pairs = np.diff(cells.present.astype(np.int8), axis=axis)
+        both = (pairs == 0) & np.delete(cells.present, 0, axis)
+        found.append(np.diff(images, axis=axis)[:, both] / step)
+    count = sum(slopes.shape[1] for slopes in found)
+    weighted = [slopes * np.sqrt(count / max(slopes.shape[1], 1)) for slopes in found]
+    return np.concatenate(weighted, axis=1)
 
 
 def _neighboured(present: BoolArray) -> BoolArray:

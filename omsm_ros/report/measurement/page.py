@@ -24,7 +24,7 @@ from omsm_ros.report.tables import Table, part, unit_of_parameter
 from omsm_ros.report.verdict import PageVerdict, covered, registered_figures, verdict_on_measurement
 from omsm_ros.units import MILLIMETRE_M
 
-_SLOPES = ("slope_rms", "slope_largest", "slope_rms_without_second_order")
+_SLOPES = ("Sdq", "slope_rms", "slope_largest", "slope_rms_without_second_order")
 _OTHER_UNITS = {"Ssk": "", "Sku": ""} | dict.fromkeys(_SLOPES, "rad")
 _SIGNED = ("Ssk", "edge_roll_off")
 _CONFORMITY = {

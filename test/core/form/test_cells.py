@@ -72,7 +72,7 @@ def test_noise_is_in_the_uncertainty_and_an_effect_too():
     quiet = square(wave(2e-3, 1e-9))
     noisy = square(wave(2e-3, 1e-9), noise=2e-8, effects=[wave(2e-3, 5e-10)])
     figures = [texture(c, c, bands_of(c)) for c in map(GridCells.of, (quiet, noisy))]
-    for name in ("Sq", "Sa", "Sz", "slope_rms"):
+    for name in ("Sq", "Sa", "Sz", "Sdq", "slope_rms"):
         true, found = (of[name] for of in figures)
         assert abs(found.value - true.value) < 2 * found.uncertainty
         assert found.uncertainty > 0.2 * abs(found.value - true.value)
@@ -193,6 +193,7 @@ def test_figures_of_the_texture_are_those_of_the_surface_and_not_of_its_cells(ev
     )
     steep = np.sqrt(sum((2 * np.pi * a / length) ** 2 for length, a, _ in waves) / 2)
     assert found["slope_rms"].value == pytest.approx(steep, rel=0.006)
+    assert found["Sdq"].value == pytest.approx(steep, rel=0.01)
     squares = sum(a * a for _, a, _ in waves) / 2
     assert power_density(cells).mean_square_in_band == pytest.approx(squares, rel=0.05, abs=0)
 

@@ -59,6 +59,9 @@ def test_texture_of_two_levels_is_known_by_hand():
     assert found["Sz"].value == pytest.approx(40e-9, rel=2e-3)
     assert found["Ssk"].value == pytest.approx((1 - 2 * p) / np.sqrt(p * (1 - p)), rel=2e-3)
     assert found["Sku"].value == pytest.approx(1 / (p * (1 - p)) - 3, rel=2e-3)
+    # Each of 16 blocks has four edges of 24 steps.
+    edges = 4 * 16 * 24 / (216 * 215)
+    assert found["Sdq"].value == pytest.approx(40e-9 / 1e-4 * np.sqrt(edges), rel=1e-9)
 
 
 def test_texture_upside_down_and_turned_is_the_same_but_for_its_skewness():
@@ -66,7 +69,7 @@ def test_texture_upside_down_and_turned_is_the_same_but_for_its_skewness():
     usual, down, turned = (
         texture(c, c, bands_of(c)) for c in map(cells_of, (values, -values, values.T))
     )
-    assert {"Sa", "Sq", "Sz", "Ssk", "Sku"} <= set(usual)
+    assert {"Sa", "Sq", "Sz", "Ssk", "Sku", "Sdq"} <= set(usual)
     for name, figure in usual.items():
         sign = -1 if name == "Ssk" else 1
         assert down[name].value == pytest.approx(sign * figure.value)
@@ -81,11 +84,14 @@ def test_slopes_of_a_plane_are_its_own_whatever_cells_are_missing():
         found = texture(cells, cells, bands_of(cells))
         assert found["slope_rms"].value == pytest.approx(5e-6, rel=1e-4)
         assert found["slope_largest"].value == pytest.approx(5e-6, rel=1e-3)
+        unfiltered = texture(cells, cells, bands_of(cells, None, 1e3))
+        assert unfiltered["Sdq"].value == pytest.approx(5e-6, rel=1e-4)
 
 
 def test_a_single_cell_has_no_slope():
     one = cells_of(np.ones((1, 1)))
-    assert texture(one, one, bands_of(one))["slope_rms"] == UncertainValue(None, None)
+    for name in ("slope_rms", "Sdq"):
+        assert texture(one, one, bands_of(one))[name] == UncertainValue(None, None)
 
 
 def test_a_constant_effect_makes_no_texture_uncertain():
