@@ -50,7 +50,13 @@ def _psd(psd, z, dx, window):
 
 def main(path):
     content = np.load(path)
-    given = content["z"], float(content["dx"]), float(content["dy"]), content["band"], content["window"]
+    given = (
+        content["z"],
+        float(content["dx"]),
+        float(content["dy"]),
+        content["band"],
+        content["window"],
+    )
     found = {}
     for peer in (surfalize, topography, prysm):
         try:

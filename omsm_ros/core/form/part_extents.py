@@ -12,6 +12,7 @@ error. Form taken for a move and upper bounds count as in :mod:`omsm_ros.core.fo
 
 A scan sees the part on its tracks only. What the form may reach between them, and from the last
 track to the rim, is extrapolated; half of it is added, and as much is the standard uncertainty.
+So is half of what single points show alone, which may be dust, subtracted.
 """
 
 from __future__ import annotations
@@ -62,8 +63,11 @@ _CHIP, _AROUND, _REACH, _PLACES = 12, 24, 1.5, 360
 # Neighbours on the next tracks, way to the middle between two, and the surroundings of a peak, in
 # distances of the tracks; distance of the middle of the neighbours beyond which it is at the rim.
 _NEXT, _HALF_WAY, _AWAY, _ONE_SIDED = (0.7, 1.3), 0.5, (2.0, 3.5), 0.3
-# Peaks at either end, and share of the height of one that its surroundings hide.
-_PEAKS, _UNSEEN = 6, 0.05
+# Peaks and single points at either end, and share of the height of a peak that its surroundings
+# hide.
+_PEAKS, _SINGLE, _UNSEEN = 6, 24, 0.05
+# Share of the height of a peak that its neighbours show, unless it is a single point.
+_COMPANY = 1 / 3
 # Most by which a summit that both neighbouring tracks miss exceeds what one track shows of it.
 MOST_UNSEEN = float(_UNSEEN ** -(_HALF_WAY**2))
 # Least singular value of a parabola through neighbours, and the weight of its curvature.
@@ -154,7 +158,8 @@ class _PartForm(NamedTuple):
         order = self.local[np.argsort(form[self.local])]
         some = np.concatenate([even, order[:_HALF], order[-_HALF:]])
         drawn = _drawn(map_.part(some), self, form[some], some)
-        of_gaps = gaps.beyond(self, form, map_.area) if gaps else (np.zeros(2), (0.0, 0.0))
+        still = np.zeros(2), np.zeros(2), (0.0, 0.0)
+        beyond, alone, more_square = gaps.beyond(self, form, map_.area) if gaps else still
         of_waves = [np.max(way * form + self.texture) - np.max(way * form) for way in (-1, 1)]
         found = []
         many = form[_equal_areas(map_.area, _MOST_FITTED)]
@@ -169,12 +174,15 @@ class _PartForm(NamedTuple):
             # An extent has two ends, each blurred independently.
             of_blur = 2 * of_some * np.sqrt(2) * self.blurred
             figure = of_square(square, length(of_errors, _rms(more - again), of_taken, of_blur))
-            between = np.maximum(of_gaps[0], of_waves) if all_ is form else np.zeros(2)
+            between, short = np.maximum(beyond, of_waves), alone
+            if all_ is not form:
+                between, short = np.zeros((2, 2))
             lost, unsure = self._lost(self.mean + shift) if all_ is form else (0.0, 0.0)
-            value = (figure.value or 0.0) + lost + _extents(all_, ends) - of_some + sum(between) / 2
-            spread = length(figure.uncertainty or 0.0, *(between / 2), unsure)
+            value = (figure.value or 0.0) + lost + _extents(all_, ends) - of_some
+            value += sum(between - short) / 2
+            spread = length(figure.uncertainty or 0.0, *(between / 2), *(short / 2), unsure)
             found.append(UncertainValue(float(value), spread))
-        return found[0], found[1], of_gaps[1]
+        return found[0], found[1], more_square
 
     def _lost(self, mean: FloatArray) -> tuple[float, float]:
         """Return the extent that the ``mean`` (n,) misses, and its standard uncertainty [m].
@@ -246,26 +254,28 @@ class _Gaps(NamedTuple):
 
     def beyond(
         self, part: _PartForm, form: FloatArray, area: FloatArray
-    ) -> tuple[FloatArray, tuple[float, float]]:
-        """Return how far the form may reach beyond its extremes (2,) [m], and more of its square.
+    ) -> tuple[FloatArray, FloatArray, tuple[float, float]]:
+        """Return how far the form may reach beyond its extremes, and fall short of them (2,) [m].
 
-        That is what the form between the last track and the rim adds to its mean square, and the
+        Third is what the form between the last track and the rim adds to its mean square, and the
         standard uncertainty of that [m²].
 
         form, area: of the points of the ``part``, each (n,) [m], the area of any unit
         """
         rim, further = np.sum(self.weights * form[self.near], axis=2)
-        weights, found = np.sum(self.weights, axis=0), []
+        weights, found, alone = np.sum(self.weights, axis=0), [], []
         chance = 2 * np.sqrt(np.sum((weights * part.error[self.near]) ** 2, axis=1))
         for sign, unseen in zip((-1, 1), part.unseen, strict=True):
             values = sign * form
             at_rim = float(np.max(sign * (rim + further) - chance, initial=-np.inf))
             summit = self._summit(values + unseen, sign * part.above + unseen, part.error)
             found.append(max(summit, at_rim) - float(values.max()))
+            alone.append(self._alone(values))
         # The points stand for the way to the rim; along it the form changes by half on average.
         more = float(self.share @ (rim**2 - form[self.near[:, 0]] ** 2)) / 4
         higher = float(np.mean(rim**2) - np.average(form**2, weights=area)) if len(rim) else 0.0
-        return np.maximum(found, 0.0), (more, length(more, self.strip * higher))
+        square = (more, length(more, self.strip * higher))
+        return np.maximum(found, 0.0), np.array(alone), square
 
     def _summit(self, values: FloatArray, above: FloatArray, noise: FloatArray) -> float:
         """Return how high ``values`` (n,) [m] may be between the tracks.
@@ -277,15 +287,38 @@ class _Gaps(NamedTuple):
             peak = int(np.argmax(may))
             if may[peak] <= highest:
                 break
-            near = np.flatnonzero(np.abs(self.x - self.x[peak]) < _AWAY[1] * self.spacing)
-            at = (self.x[near] - self.x[peak]) + 1j * (self.y[near] - self.y[peak])
-            at /= self.spacing
-            about = np.abs(at) < _AWAY[1]
-            near, at = near[about], at[about]
+            near, at = self._about(peak)
             rise = _rise(at, values[near], values[peak], float(noise[peak]))
             highest = max(highest, float(values[peak]) + rise)
             may[near] = -np.inf
         return highest
+
+    def _alone(self, values: FloatArray) -> float:
+        """Return how far the highest of ``values`` (n,) [m] exceeds those that have company.
+
+        Single points among others that show nothing of them may be dust, or narrower than the
+        tracks.
+        """
+        left, highest = values.copy(), float(values.max())
+        for _ in range(_SINGLE):
+            peak = int(np.argmax(left))
+            near, at = self._about(peak)
+            away = np.abs(at)
+            shown = values[near[(away > 0) & (away < _NEXT[1])]]
+            dense = np.any((away > 0) & (away < _HALF_WAY))
+            base = float(np.median(shown if dense else values[near[away > _AWAY[0]]]))
+            if not np.max(shown, initial=-np.inf) - base < _COMPANY * (values[peak] - base):
+                break
+            left[peak] = -np.inf
+        return highest - float(left.max())
+
+    def _about(self, peak: int) -> tuple[IntArray, NDArray[np.complex128]]:
+        """Return the points (k,) about a ``peak``, and their places in distances of the tracks."""
+        near = np.flatnonzero(np.abs(self.x - self.x[peak]) < _AWAY[1] * self.spacing)
+        at = (self.x[near] - self.x[peak]) + 1j * (self.y[near] - self.y[peak])
+        at /= self.spacing
+        about = np.abs(at) < _AWAY[1]
+        return near[about], at[about]
 
 
 def _rise(at: NDArray[np.complex128], values: FloatArray, peak: float, noise: float) -> float:

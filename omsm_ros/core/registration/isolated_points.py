@@ -26,10 +26,10 @@ _REACH = 1.5
 _GAP = 2
 # Points of an event that is longer along its track than the reach, and no grain of dust.
 _LONG = 3
-# Events of one defect differ in size by less than this factor; and reaches between them, with the
-# factor for events that are farther apart.
+# Events of one defect differ in size by less than this factor, unless there is little dust that may
+# meet by chance; reaches between them, with the factor for events that are farther apart.
 _SIMILAR = 2.0
-_SCALES = ((1.0, _SIMILAR), (3.0, 1.2))
+_SCALES = ((1.0, np.inf), (1.0, _SIMILAR), (3.0, 1.2))
 # A point of a defect is dust beyond this multiple of the usual size of this number of neighbours.
 _DENSE, _AROUND = 1.5, 16
 # A point little beyond the limit is form if this share of the points around is half as far; noise
@@ -107,7 +107,7 @@ class FarPoints:
                 form = _confirmed(event, rows, space, self.points)
                 for begin in range(0, len(form), _AT_A_TIME):
                     open_ = begin + np.flatnonzero(~form[begin : begin + _AT_A_TIME])
-                    form[open_] = self._like_surroundings(open_, event, rows, space)
+                    form[open_] |= self._like_surroundings(open_, form, event, rows, space)
                 form = self._without_spikes(form, rows, space)
             else:
                 cluster, _ = _clusters(event, rows, space.reach, _SIMILAR)
@@ -115,12 +115,13 @@ class FarPoints:
         return index[~form], form
 
     def _like_surroundings(
-        self, at: IntArray, event: IntArray, rows: FloatArray, space: _Space
+        self, at: IntArray, form: BoolArray, event: IntArray, rows: FloatArray, space: _Space
     ) -> BoolArray:
         """Return which far points ``at`` (m,) are like a good share of the points around.
 
         A slope of the form crosses the limit between two points, and a pip in the centre of a
-        spiral is crossed by few turns. Points of the same event do not count.
+        spiral is crossed by few turns. Points of the same event do not count; two of other events
+        that are ``form`` (k,) are enough.
         """
         from scipy.spatial import cKDTree
 
@@ -133,15 +134,18 @@ class FarPoints:
         )
         ratio = others[3][pairs.col] / rows[3][at][pairs.row]
         little = np.abs(rows[3][at]) <= 2 * self.limit
-        like = (ratio > 1 / _SIMILAR) & ((ratio < _SIMILAR) | little[pairs.row])
+        known = np.append(form, np.zeros(others.shape[1] - len(form), bool))[pairs.col]
+        # A larger one is no slope of the form if it is dust itself.
+        like = (ratio > 1 / _SIMILAR) & ((ratio < _SIMILAR) | (little[pairs.row] & known))
         like &= events[pairs.col] != event[at][pairs.row]
-        count = np.bincount(pairs.row[like], minlength=len(at))
+        count, company = (
+            np.bincount(pairs.row[v], minlength=len(at)) for v in (like, like & known)
+        )
         # Where few points are around, dust too has company; only clusters tell.
         around = space.around(rows[4][at])
         decided = little | (around >= _FEW / _SHARE_AROUND)
-        return np.asarray(
-            decided & (count >= np.maximum(_SHARE_AROUND * around, 1.0 if space.line else _FEW))
-        )
+        enough = count >= np.maximum(_SHARE_AROUND * around, 1.0 if space.line else _FEW)
+        return np.asarray((decided & enough) | (company >= _FEW))
 
     def _without_spikes(self, form: BoolArray, rows: FloatArray, space: _Space) -> BoolArray:
         """Return which far points (k,) are ``form`` or lie about it, and are no dust on it.
@@ -259,9 +263,10 @@ def _clusters(
     links = np.ones(int(linked.sum())), (event[one[linked]], event[other[linked]])
     count = int(event[-1]) + 1
     group = connected_components(coo_array(links, (count, count)), directed=False)[1]
-    sizes = np.log(np.abs(residual[some[: 2 * (len(some) // 2)]])).reshape(2, -1)
-    near = np.abs(sizes[0] - sizes[1]) < np.log(similar)
-    return group[event], float(np.mean(near)) if near.size else 1.0
+    # One more pair that is similar, because of few none may be by chance.
+    sizes = np.sort(np.abs(residual[some]))
+    near = np.searchsorted(sizes, similar * sizes) - np.arange(1, len(sizes) + 1)
+    return group[event], float((np.sum(near) + 1) / (len(sizes) * (len(sizes) - 1) / 2 + 1))
 
 
 def _confirmed(event: IntArray, rows: FloatArray, space: _Space, points: int) -> BoolArray:
@@ -271,10 +276,18 @@ def _confirmed(event: IntArray, rows: FloatArray, space: _Space, points: int) ->
     lengths = np.add.reduceat(np.concatenate([steps, [0.0]]), begins)
     many = np.bincount(event) >= _LONG
     form = (many & (lengths > np.maximum(space.reach, rows[4, begins])))[event]
-    for factor, similar in _SCALES:
-        wide = replace(space, reach=factor * space.reach, share=space.larger(factor) * space.share)
-        cluster, alike = _clusters(event, rows, wide.reach, similar)
-        form |= _no_chance(cluster[begins], rows[:, begins], wide, points, alike)[cluster]
+    # Dust that is long, too, is rarer, so that few events of it are no chance.
+    for chosen in (np.ones(len(event), bool), many[event]):
+        if not np.any(chosen):
+            continue
+        some, own = rows[:, chosen], np.unique(event[chosen], return_inverse=True)[1]
+        begins = np.flatnonzero(np.diff(own, prepend=-1))
+        for factor, similar in _SCALES:
+            share = space.larger(factor) * space.share
+            wide = replace(space, reach=factor * space.reach, share=share)
+            cluster, alike = _clusters(own, some, wide.reach, similar)
+            sure = _no_chance(cluster[begins], some[:, begins], wide, points, alike)
+            form[chosen] |= sure[cluster]
     return np.asarray(form)
 
 
