@@ -76,13 +76,6 @@ _CHANCE = 0.02
 _MOST_POINTS = 4_000
 
 
-def _terms(map_: DeviationMap, found: Registration) -> ZernikeFit:
-    points = (map_.x, map_.y, map_.deviation)
-    terms = ZERNIKES[: len(map_) // 2]
-    fit = fit_zernikes(*points, terms, found.disc, weights=map_.area, effects=map_.effects)
-    return with_pose_uncertainty(fit, map_, found)
-
-
 def with_pose_uncertainty(fit: ZernikeFit, map_: DeviationMap, found: Registration) -> ZernikeFit:
     """Return the fit with the effect of lateral pose errors on its terms.
 
@@ -241,7 +234,9 @@ def analyse_form(
     uncovered, outline = best_covered(x, y, found.spacing, aperture or found.disc, aperture is None)
     bounded = [*[n for n, s in enumerate(sources) if s in bounds], *held]
     map_ = gathered.map(found, area_weights(x, y, even=even, outline=outline), bounded)
-    zernike = _terms(map_, found)
+    points, terms = (map_.x, map_.y, map_.deviation), ZERNIKES[: len(map_) // 2]
+    fit = fit_zernikes(*points, terms, found.disc, weights=map_.area, effects=map_.effects)
+    zernike = with_pose_uncertainty(fit, map_, found)
     cells = GridCells.of(map_, even=even)
     bands = bands_of(cells, *filters)
     figures, rest = _figures(map_, gathered, found, outline, even)

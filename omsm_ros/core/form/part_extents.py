@@ -57,14 +57,13 @@ _SHIFTS = (0.0, 1 / 3, 2 / 3)
 _CHANCE = 3.0
 # Least variance, so that a part without noise keeps all terms [m²].
 _TINY = 1e-40
-# Points of a chip at an extreme that no test of the whole map shows. Points that continue the form
-# to a place of the rim; how far they may be off, in distances of the tracks; number of places.
-_CHIP, _AROUND, _REACH, _PLACES = 12, 24, 1.5, 360
+# Points that continue the form to a place of the rim; how far they may be off, in distances of the
+# tracks; number of places.
+_AROUND, _REACH, _PLACES = 24, 1.5, 360
 # Neighbours on the next tracks, way to the middle between two, and the surroundings of a peak, in
 # distances of the tracks; distance of the middle of the neighbours beyond which it is at the rim.
 _NEXT, _HALF_WAY, _AWAY, _ONE_SIDED = (0.7, 1.3), 0.5, (2.0, 3.5), 0.3
-# Peaks and single points at either end, and share of the height of a peak that its surroundings
-# hide.
+# Peaks and single points at either end, and share of the height of a peak that is hidden.
 _PEAKS, _SINGLE, _UNSEEN = 6, 24, 0.05
 # Share of the height of a peak that its neighbours show, unless it is a single point.
 _COMPANY = 1 / 3
@@ -106,9 +105,7 @@ class _PartForm(NamedTuple):
 
     value: (n,) [m];  smooth: its smooth terms
     cell, error: number of the cell (n,) whose mean a point has, and its noise [m]
-    mean: value without the share of a single point (n,);  rest: deviation less the value (n,) [m]
     above: value less the smooth terms (n,) [m]
-    noise: of the deviation [m]
     local: points that differ from the smooth form (m,);  blurred: rms of the form lost [m]
     texture: height of waves that the scatter about the value shows, but no mean (n,) [m]
     unseen: how far other grids of cells show the form below and above the value (2, n) [m]
@@ -118,10 +115,7 @@ class _PartForm(NamedTuple):
     smooth: ZernikeFit
     cell: IntArray
     error: FloatArray
-    mean: FloatArray
-    rest: FloatArray
     above: FloatArray
-    noise: float
     local: IntArray
     blurred: float
     texture: FloatArray
@@ -139,15 +133,11 @@ class _PartForm(NamedTuple):
         share = more / (more + map_.noise**2) if more else 0.0
         value, error = mean + share * left, np.full(len(map_), share * map_.noise)
         value[local], error[local], cell[local] = form, noise, len(map_) + own
-        above = value - mean
-        mean[local], blurred = form, (1 - share) * float(np.sqrt(more))
-        left, unseen = map_.deviation - value, np.zeros((2, len(map_)))
+        blurred = (1 - share) * float(np.sqrt(more))
+        waves, unseen = _texture(map_, map_.deviation - value), np.zeros((2, len(map_)))
         for at, other, *_ in others:
             unseen[:, at] = np.maximum(unseen[:, at], np.outer((-1, 1), other - value[at]))
-        texture = _texture(map_, left)
-        return cls(
-            value, fit, cell, error, mean, left, above, map_.noise, local, blurred, texture, unseen
-        )
+        return cls(value, fit, cell, error, value - mean, local, blurred, waves, unseen)
 
     def extents(
         self, map_: DeviationMap, shift: FloatArray, gaps: _Gaps | None
@@ -167,35 +157,20 @@ class _PartForm(NamedTuple):
             of_some, *ways = (_extents(way[:count], ends) for way in (form[some], *drawn))
             again, more, likely, full, noise = (way**2 for way in ways)
             square = float(of_some**2 - np.mean(again) + np.mean(likely))
-            of_taken = _rms(full - np.mean(likely))
+            of_bounds, of_taken = np.sqrt(
+                np.mean(np.square([more - again, full - np.mean(likely)]), axis=1)
+            )
             # Where many points compete for an extreme, the mean of the draws follows the noise of
             # the figure in part, so that it counts once to twice: the factor is √2.
             of_errors = length(*np.std([again, noise], axis=1))
             # An extent has two ends, each blurred independently.
             of_blur = 2 * of_some * np.sqrt(2) * self.blurred
-            figure = of_square(square, length(of_errors, _rms(more - again), of_taken, of_blur))
-            between, short = np.maximum(beyond, of_waves), alone
-            if all_ is not form:
-                between, short = np.zeros((2, 2))
-            lost, unsure = self._lost(self.mean + shift) if all_ is form else (0.0, 0.0)
-            value = (figure.value or 0.0) + lost + _extents(all_, ends) - of_some
-            value += sum(between - short) / 2
-            spread = length(figure.uncertainty or 0.0, *(between / 2), *(short / 2), unsure)
+            figure = of_square(square, length(of_errors, of_bounds, of_taken, of_blur))
+            between = np.append(np.maximum(beyond, of_waves), -alone) / 2 * (all_ is form)
+            value = (figure.value or 0.0) + _extents(all_, ends) - of_some + float(np.sum(between))
+            spread = length(figure.uncertainty or 0.0, *between)
             found.append(UncertainValue(float(value), spread))
         return found[0], found[1], more_square
-
-    def _lost(self, mean: FloatArray) -> tuple[float, float]:
-        """Return the extent that the ``mean`` (n,) misses, and its standard uncertainty [m].
-
-        That is what it leaves at its extremes on average, shrunk by the noise of this average.
-        """
-        order, found, square = np.argsort(mean), 0.0, 0.0
-        for sign, ends in ((-1, order[:_CHIP]), (1, order[-_CHIP:])):
-            left, variance = float(np.mean(self.rest[ends])), self.noise**2 / len(ends)
-            share = max(1 - variance / left**2, 0.0) if left else 0.0
-            found += sign * share * left
-            square += share * variance + ((1 - share) * left) ** 2
-        return found, float(np.sqrt(square))
 
 
 def _extents(values: FloatArray, ends: tuple[float, float]) -> FloatArray:
@@ -294,23 +269,19 @@ class _Gaps(NamedTuple):
         return highest
 
     def _alone(self, values: FloatArray) -> float:
-        """Return how far the highest of ``values`` (n,) [m] exceeds those that have company.
-
-        Single points among others that show nothing of them may be dust, or narrower than the
-        tracks.
-        """
-        left, highest = values.copy(), float(values.max())
+        """Return how far single points of ``values`` (n,) [m] exceed all that neighbours show."""
+        left = values.copy()
         for _ in range(_SINGLE):
             peak = int(np.argmax(left))
             near, at = self._about(peak)
             away = np.abs(at)
             shown = values[near[(away > 0) & (away < _NEXT[1])]]
             dense = np.any((away > 0) & (away < _HALF_WAY))
-            base = float(np.median(shown if dense else values[near[away > _AWAY[0]]]))
+            base = float(np.median(shown if dense else values[near]))
             if not np.max(shown, initial=-np.inf) - base < _COMPANY * (values[peak] - base):
                 break
             left[peak] = -np.inf
-        return highest - float(left.max())
+        return float(values.max() - left.max())
 
     def _about(self, peak: int) -> tuple[IntArray, NDArray[np.complex128]]:
         """Return the points (k,) about a ``peak``, and their places in distances of the tracks."""
@@ -521,7 +492,3 @@ def _drawn(
         return drawn, bounded, still, still, noisy
     likely, full = anew(root_of_products(map_.taken) @ taken), anew(taken)
     return drawn, bounded, still + likely, still + full, noisy
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -284,8 +284,7 @@ def _neighboured(present: BoolArray) -> BoolArray:
     found = np.full(present.shape, max(present.shape) > 1)
     for axis in [axis for axis, size in enumerate(present.shape) if size > 1]:
         pad = np.pad(present, [(1, 1) if n == axis else (0, 0) for n in (0, 1)])
-        size = present.shape[axis]
-        found &= pad.take(range(size), axis) | pad.take(range(2, size + 2), axis)
+        found &= np.delete(pad, [-2, -1], axis) | np.delete(pad, [0, 1], axis)
     return found
 
 
@@ -460,7 +459,11 @@ def profiles(map_: DeviationMap, disc: Aperture) -> dict[str, UncertainCurve]:
     }
     width = _ring(x, y, disc.radius)
     made["radius"] = lambda d: radial_profile(x, y, d, spacing=width)
-    made["angle"] = lambda d: _around(x, y, d, disc.radius)
+    outer, step = np.hypot(x, y) >= _OUTER * disc.radius, _DEGREES * np.pi / 180
+    angle = np.arctan2(y[outer], x[outer])
+    made["angle"] = lambda d: line_profile(
+        angle, 0 * angle, d[:, outer], half_width=1.0, spacing=step
+    )
     if np.any(rim := np.hypot(x, y) >= _EDGE * disc.radius):
         narrow = _ring(x[rim], y[rim], disc.radius / _FINER_AT_EDGE, disc.radius)
         made["edge"] = lambda d: radial_profile(x[rim], y[rim], d[:, rim], spacing=narrow)
@@ -478,7 +481,7 @@ def edge_roll_off(map_: DeviationMap, outline: Aperture) -> UncertainValue:
     angle = np.arctan2(map_.y - outline.y, map_.x - outline.x)
     x, y = size * np.cos(angle), size * np.sin(angle)
     width = _ring(x, y, 1.0 / _FINER_AT_EDGE, 1.0)
-    rings = radial_profile(x, y, _with_effects(map_), spacing=width)
+    rings = radial_profile(x, y, np.vstack([map_.deviation, map_.effects]), spacing=width)
     inner = (rings.position > _FLAT[0]) & (rings.position < _FLAT[1])
     if np.sum(inner) < 4 or rings.position[-1] < _EDGE:
         return UncertainValue(None, None)
@@ -504,19 +507,8 @@ def _ring(x: FloatArray, y: FloatArray, *radii: float) -> float:
     return float(widths[-1])
 
 
-def _around(x: FloatArray, y: FloatArray, deviation: FloatArray, radius: float) -> Profile:
-    outer = np.hypot(x, y) >= _OUTER * radius
-    angle, spacing = np.arctan2(y[outer], x[outer]), _DEGREES * np.pi / 180
-    return line_profile(angle, 0 * angle, deviation[:, outer], half_width=1.0, spacing=spacing)
-
-
-def _with_effects(map_: DeviationMap) -> FloatArray:
-    return np.concatenate([map_.deviation[np.newaxis], map_.effects])
-
-
 def _curve(map_: DeviationMap, average: Callable[[FloatArray], Profile]) -> UncertainCurve:
-    profile = average(_with_effects(map_))
-    variance = map_.noise**2 / np.maximum(profile.points, 1) + np.sum(
-        profile.value[1:] ** 2, axis=0
-    )
+    profile = average(np.vstack([map_.deviation, map_.effects]))
+    of_effects = np.sum(profile.value[1:] ** 2, axis=0)
+    variance = map_.noise**2 / np.maximum(profile.points, 1) + of_effects
     return UncertainCurve(profile.position, profile.value[0], np.sqrt(variance))

@@ -195,7 +195,10 @@ def _scores(
     residuals are therefore those from the fit to all other groups (delete-a-group jackknife;
     R. Bell, D. McCaffrey, Surv. Methodol. 28, 169).
     """
-    begins, differences = _groups(x, y, len(terms))
+    begins, differences = passes(x, y), DIFFERENCES
+    if begins is None:
+        size = _GROUP if len(x) >= _GROUP * _LEAST_GROUPS * len(terms) else 1
+        begins, differences = np.arange(0, len(x), size), 0
     ends = np.append(begins[1:], len(x))
     sums, single = np.empty((len(terms), len(begins))), np.zeros((len(terms), len(terms)))
     first = 0
@@ -207,7 +210,10 @@ def _scores(
         residual = deviation[chunk] - coefficients @ columns
         weighted = columns if weights is None else columns * weights[chunk]
         products = weighted * residual
-        alone = weighted * _uncorrelated_residual(residual) if differences else products
+        rough = residual
+        if differences and len(residual) > 2:  # the noise along the path
+            rough = np.pad(np.diff(residual, 2) / np.sqrt(6), 1, "edge")
+        alone = weighted * rough
         single += alone @ alone.T
         sizes = ends[groups] - begins[groups]
         sums[:, groups] = _group_sums(products, columns, weighted, inverse, sizes)
@@ -218,26 +224,6 @@ def _scores(
     free = count if differences else count - 1
     dof = max(1 - len(terms) / len(x), 1e-3)
     return scatter @ scatter.T * len(begins) / free / dof, single / dof
-
-
-def _uncorrelated_residual(residual: FloatArray) -> FloatArray:
-    """Return the noise in the ``residual`` (n,) along a path, from its second differences."""
-    if len(residual) < 3:
-        return residual
-    rough = np.diff(residual, 2) / np.sqrt(6)
-    return np.asarray(np.concatenate([rough[:1], rough, rough[-1:]]), np.float64)
-
-
-def _groups(x: FloatArray, y: FloatArray, terms: int) -> tuple[IntArray, int]:
-    """Return the first points of the groups (g,), and the order of differences over their sums.
-
-    terms: number of fitted terms
-    """
-    begins = passes(x, y)
-    if begins is not None:
-        return begins, DIFFERENCES
-    size = _GROUP if len(x) >= _GROUP * _LEAST_GROUPS * terms else 1
-    return np.arange(0, len(x), size), 0
 
 
 def _group_sums(

@@ -335,10 +335,9 @@ def relaxation_factor(share: float, last: FloatArray, step: FloatArray) -> float
     """Return the share of a ``step`` (p,) to take, after ``share`` of the ``last`` one.
 
     Where form and pose look alike a whole step overshoots, because the form follows the pose
-    (Aitken's relaxation; B. Irons, R. Tuck, Int. J. Numer. Meth. Eng. 1, 275).
+    (Aitken's relaxation; B. Irons, R. Tuck, Int. J. Numer. Meth. Eng. 1, 275). Steps that grow in
+    one direction are taken whole.
     """
     change = last - step
-    square = float(change @ change)
-    if not np.any(last) or square == 0:
-        return 1.0
-    return float(np.clip(share * float(last @ change) / square, _LEAST_RELAXED, 1.0))
+    along, square = float(last @ change), float(change @ change)
+    return float(np.clip(share * along / square, _LEAST_RELAXED, 1.0)) if along > 0 else 1.0

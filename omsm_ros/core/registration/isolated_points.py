@@ -276,18 +276,10 @@ def _confirmed(event: IntArray, rows: FloatArray, space: _Space, points: int) ->
     lengths = np.add.reduceat(np.concatenate([steps, [0.0]]), begins)
     many = np.bincount(event) >= _LONG
     form = (many & (lengths > np.maximum(space.reach, rows[4, begins])))[event]
-    # Dust that is long, too, is rarer, so that few events of it are no chance.
-    for chosen in (np.ones(len(event), bool), many[event]):
-        if not np.any(chosen):
-            continue
-        some, own = rows[:, chosen], np.unique(event[chosen], return_inverse=True)[1]
-        begins = np.flatnonzero(np.diff(own, prepend=-1))
-        for factor, similar in _SCALES:
-            share = space.larger(factor) * space.share
-            wide = replace(space, reach=factor * space.reach, share=share)
-            cluster, alike = _clusters(own, some, wide.reach, similar)
-            sure = _no_chance(cluster[begins], some[:, begins], wide, points, alike)
-            form[chosen] |= sure[cluster]
+    for factor, similar in _SCALES:
+        wide = replace(space, reach=factor * space.reach, share=space.larger(factor) * space.share)
+        cluster, alike = _clusters(event, rows, wide.reach, similar)
+        form |= _no_chance(cluster[begins], rows[:, begins], wide, points, alike)[cluster]
     return np.asarray(form)
 
 

@@ -76,6 +76,7 @@ def coarse_placement(
     at: Placement,
 ) -> Placement:
     """Return the least-squares placement without outliers, the start of the fit with form."""
+    share, last = 1.0, np.zeros(len(names))
     for turn in range(_MOST_TURNS):
         points = inside_aperture(placed(surface, at, chosen), aperture)
         if turn and len(points.x):
@@ -95,7 +96,9 @@ def coarse_placement(
             np.array([at.value(n) for n in names]) * scale,
             [typical_range(n) for n in names] * scale,
         )
-        at = at.moved(names, step / scale)
+        # Points that come and go at the limit may keep the steps alternating.
+        share, last = relaxation_factor(share, last, step), step
+        at = at.moved(names, share * step / scale)
         settled = max(SHARE_OF_SPREAD * statistics.spread(points.deviation), _SETTLED_M)
         # The joint effect counts: a tilt may cancel a shift.
         moved = float(np.sqrt(np.mean((step @ columns) ** 2)))
@@ -261,9 +264,6 @@ class _PoseFit:
     def names(self) -> tuple[str, ...]:
         return self.dofs.fitted
 
-    def new_sums(self, sources: int) -> FormNormalEquations:
-        return FormNormalEquations(len(self.names) + len(self.basis), sources)
-
     def unknown(self, at: Placement, chosen: PointBatch) -> dict[str, dict[str, FloatArray]]:
         """Return the effect (2,) of each undetermined pose parameter on each fitted one.
 
@@ -358,7 +358,7 @@ class _PoseFit:
             residual = points.deviation - like @ columns
             near = np.abs(residual) <= limit
             none = np.empty((0, int(near.sum())))
-            sums = self.new_sums(0)
+            sums = FormNormalEquations(len(self.names) + len(self.basis), 0)
             sums.add(columns[:, near], points.deviation[near], none, residual[near])
             found, _ = self.solved(at, sums)
             own = np.sqrt(np.diag(sums.gram)[: len(self.names)] / sums.points)
@@ -388,7 +388,7 @@ def _over_all(
 ) -> Registration:
     """Return the registration from one pass over all points, in which dust comes last."""
     free, held = len(fit.names), root_of(open_.held)
-    sums = fit.new_sums(len(sources) + 2 * len(held))
+    sums = FormNormalEquations(free + len(fit.basis), len(sources) + 2 * len(held))
     square, points, far, beyond = 0.0, 0.0, FarPoints(stand.limit), []
     for portion in portions():
         beyond.append(fit.sums(stand, portion, held, sums, far))

@@ -165,19 +165,16 @@ def smallest_disc(x: FloatArray, y: FloatArray) -> tuple[tuple[float, float], fl
         away = np.abs(places - middle)
         far = int(np.argmax(away))
         if away[far] <= radius * (1 + 1e-12) or len(resting) > 3:
-            return _found(middle, away[far])
+            break
         points = [*resting, places[far]]
         rests = [r for k in (2, 3) for r in combinations(points, k)]
         discs = [(c, float(np.max(np.abs(np.array(points) - c))), r) for r in rests
                  if (c := _through(*r)) is not None]  # fmt: skip
         middle, larger, through = min(discs, key=lambda disc: disc[1])
         if larger <= radius:  # rounding
-            return _found(middle, away[far])
+            break
         radius, resting = larger, list(through)
-
-
-def _found(middle: complex, radius: float) -> tuple[tuple[float, float], float]:
-    return (float(middle.real), float(middle.imag)), float(radius)
+    return (float(middle.real), float(middle.imag)), float(away[far])
 
 
 def _through(a: complex, b: complex, c: complex | None = None) -> complex | None:
