@@ -64,9 +64,8 @@ _AROUND, _REACH, _PLACES = 24, 1.5, 360
 # distances of the tracks; distance of the middle of the neighbours beyond which it is at the rim.
 _NEXT, _HALF_WAY, _AWAY, _ONE_SIDED = (0.7, 1.3), 0.5, (2.0, 3.5), 0.3
 # Peaks and single points at either end, and share of the height of a peak that is hidden.
-_PEAKS, _SINGLE, _UNSEEN = 6, 24, 0.05
-# Share of the height of a peak that its neighbours show, unless it is a single point.
-_COMPANY = 1 / 3
+# Share that the neighbours of a peak show unless it is a single point.
+_PEAKS, _SINGLE, _UNSEEN, _COMPANY = 6, 24, 0.05, 1 / 3
 # Most by which a summit that both neighbouring tracks miss exceeds what one track shows of it.
 MOST_UNSEEN = float(_UNSEEN ** -(_HALF_WAY**2))
 # Least singular value of a parabola through neighbours, and the weight of its curvature.
@@ -157,8 +156,8 @@ class _PartForm(NamedTuple):
             of_some, *ways = (_extents(way[:count], ends) for way in (form[some], *drawn))
             again, more, likely, full, noise = (way**2 for way in ways)
             square = float(of_some**2 - np.mean(again) + np.mean(likely))
-            of_bounds, of_taken = np.sqrt(
-                np.mean(np.square([more - again, full - np.mean(likely)]), axis=1)
+            of_bounds, of_taken = (
+                float(np.sqrt(np.mean(v**2))) for v in (more - again, full - np.mean(likely))
             )
             # Where many points compete for an extreme, the mean of the draws follows the noise of
             # the figure in part, so that it counts once to twice: the factor is √2.
