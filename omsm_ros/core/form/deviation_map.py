@@ -277,6 +277,20 @@ class GridCells:
 
         return fitted
 
+    def between(self, images: FloatArray) -> FloatArray:
+        """Return slopes (k, n) [1] of images (k, r, c) between neighbouring present cells.
+
+        They are weighted so that their mean square is the sum of the mean squares along x and y.
+        """
+        found = []
+        for axis, step in zip((-1, -2), self.steps, strict=True):
+            pairs = np.diff(self.present.astype(np.int8), axis=axis)
+            both = (pairs == 0) & np.delete(self.present, 0, axis)
+            found.append(np.diff(images, axis=axis)[:, both] / step)
+        count = sum(slopes.shape[1] for slopes in found)
+        weighted = [slopes * np.sqrt(count / max(slopes.shape[1], 1)) for slopes in found]
+        return np.concatenate(weighted, axis=1)
+
     def smoothed(self, images: FloatArray, cutoff: float) -> FloatArray:
         """Return images (…, r, c) after a Gaussian low-pass of ``cutoff`` [m] (ISO 16610-61)."""
         rows, columns, weight = self._weights(cutoff)

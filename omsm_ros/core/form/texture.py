@@ -259,24 +259,9 @@ def _band(
 
     def kept(images: FloatArray) -> FloatArray:
         rest = images if long is None else images - cells.smoothed(images, long)
-        return _between(cells, rest) if between else np.asarray(rest[:, cells.present])
+        return cells.between(rest) if between else np.asarray(rest[:, cells.present])
 
     return _FilteredBand([*map(kept, levels)], kept(effects), cells.noise_known)
-
-
-def _between(cells: GridCells, images: FloatArray) -> FloatArray:
-    """Return the slopes (k, n) [1] of images (k, r, c) between neighbouring present cells.
-
-    They are weighted so that their mean square is the sum of the mean squares along x and y.
-    """
-    found = []
-    for axis, step in zip((-1, -2), cells.steps, strict=True):
-        pairs = np.diff(cells.present.astype(np.int8), axis=axis)
-        both = (pairs == 0) & np.delete(cells.present, 0, axis)
-        found.append(np.diff(images, axis=axis)[:, both] / step)
-    count = sum(slopes.shape[1] for slopes in found)
-    weighted = [slopes * np.sqrt(count / max(slopes.shape[1], 1)) for slopes in found]
-    return np.concatenate(weighted, axis=1)
 
 
 def _neighboured(present: BoolArray) -> BoolArray:
