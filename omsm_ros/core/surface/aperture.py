@@ -202,8 +202,8 @@ def best_covered(
     """Return the share of an aperture that points x, y (n,) [m] leave uncovered, and the aperture.
 
     track: distance of neighbouring tracks [m]
-    free: the smallest disc around the points stands for ``aperture``, or the rectangle or ellipse
-        around them, if it has less
+    free: the smallest disc around the points stands for an ``aperture`` that lies elsewhere, or
+        the rectangle or ellipse around them, if it has less
 
     Wider gaps than holes of random points count; the rim may lie a track within the aperture's.
     """
@@ -211,12 +211,12 @@ def best_covered(
 
     box = [(float(np.ptp(v)) / 2, float(v.max() + v.min()) / 2) for v in (x, y)]
     sizes = [half for half, _ in box] + [middle for _, middle in box]
-    if free:
-        middle, radius = smallest_disc(x, y)
-        aperture = Aperture(radius or 1.0, *middle)
     track = max(track, 2 * float(np.sqrt(sizes[0] * sizes[1] / len(x))))
     if min(sizes[:2]) < track:
         return 0.0, aperture  # a profile
+    middle, radius = smallest_disc(x, y)
+    if free and np.hypot(middle[0] - aperture.x, middle[1] - aperture.y) > track:
+        aperture = Aperture(radius, *middle)
     pitch = max(2 * aperture.radius / _CELLS_ACROSS, track / 2)
     reach = max(_GAP_IN_TRACKS * track, _LEAST_CELLS * pitch) / 2 / pitch
     half = aperture.radius + (np.ceil(reach) + 1) * pitch

@@ -135,3 +135,29 @@ def test_a_rolled_edge_stays_where_steps_are_longer_than_the_tracks_are_apart():
     found = register(Flat(), lambda: [batch], ("piston", "tip", "tilt"))
     assert np.sum(rolled < -100e-9) > 200
     assert len(found.dust) < 5
+
+
+def sparse(heights):
+    """Register a spiral with steps of twice the distance of its 100 tracks, noise of 3 nm."""
+    r, c = np.linspace(R, 0, 12_000), np.linspace(0, 200 * np.pi, 12_000)
+    x, y = r * np.cos(c), r * np.sin(c)
+    height = np.random.default_rng(2).normal(0, 3e-9, len(x)) + heights(x, y)
+    batch = PointBatch(x, y, height, np.empty((0, len(x))))
+    return register(Flat(), lambda: [batch], ("piston", "tip", "tilt"))
+
+
+def test_a_pit_as_wide_as_the_tracks_are_apart_stays_where_there_is_no_dust():
+    """It shows on three tracks, with a third of its depth on two of them."""
+    found = sparse(
+        lambda x, y: -150e-9 * np.exp(-((x - x[4000]) ** 2 + (y - y[4000]) ** 2) / 0.12e-3**2)
+    )
+    assert not len(found.dust)
+
+
+def test_two_grains_of_one_size_are_no_scratch():
+    """They lie three tracks apart among thirty others of all sizes."""
+    grains = np.arange(100, 11_900, 400)
+    made = np.zeros(12_000)
+    made[grains] = np.geomspace(60e-9, 9e-6, len(grains))
+    made[grains[15] + 360] = 1.02 * made[grains[15]]
+    assert set(np.flatnonzero(made)) == set(sparse(lambda x, y: made).dust)
