@@ -141,22 +141,6 @@ def segments(steps: Steps, samples: int, least: int = 4) -> list[tuple[int, int]
     return list(pairwise(cuts))
 
 
-def backlash_columns(steps: Steps, samples: int) -> FloatArray:
-    """Return the direction of the last move and 1 before the first move, as columns (n, 0 or 2).
-
-    A backlash of b shifts the output by ±b/2 with the direction of approach.
-    """
-    if not steps.edges:
-        return np.empty((samples, 0))
-    direction = np.zeros(samples)
-    for edge in steps.edges:
-        direction[edge.start :] = np.sign(edge.height)
-    if np.all(direction[steps.edges[0].start :] == direction[-1]):
-        return np.empty((samples, 0))
-    before = (np.arange(samples) < steps.edges[0].start).astype(np.float64)
-    return np.column_stack([direction, before])
-
-
 def check_usable(record: MotionRecord) -> None:
     """Raise StepTestError for too few usable samples, or too many samples."""
     _check_length(len(record))

@@ -19,7 +19,7 @@ from numpy.polynomial import legendre
 from scipy import fft, signal
 
 from omsm_ros.core.estimation.output_error import Fit, Problem
-from omsm_ros.core.estimation.steps import Steps, backlash_columns
+from omsm_ros.core.estimation.steps import Steps
 from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import FloatArray
 
@@ -395,17 +395,15 @@ class ModelErrorFamilies:
         return without_noise(answer[: _FINER * len(self.problem.input)], self.problem.noise)
 
     def backlash(self, turning: Callable[[], FloatArray]) -> Iterator[ModelErrorFamily]:
-        """Yield half of the backlash: by the last reversal, and by the last step."""
+        """Yield half of several backlashes, by the last reversal, with the unknown start."""
+        if not self.steps.edges:
+            return
 
         def part(first: int, last: int) -> FloatArray:
             lost = [c[::_FINER] for c in backlash_lead(turning(), _GAPS_M[first:last])]
             return -self.fitted.gain * np.column_stack(lost)
 
-        if self.steps.edges:
-            yield ModelErrorFamily(BACKLASH, np.asarray(_GAPS_M), 2.0, part, 2)
-        columns = backlash_columns(self.steps, len(self.problem.input))
-        if columns.shape[1]:
-            yield ModelErrorFamily.of(BACKLASH, np.zeros(1), 1.0, -self.fitted.gain * columns)
+        yield ModelErrorFamily(BACKLASH, np.asarray(_GAPS_M), 2.0, part, 2)
 
 
 def _vertex(power: FloatArray, peak: int) -> float:

@@ -24,13 +24,7 @@ from omsm_ros.core.estimation.noise import (
     timing_variance,
 )
 from omsm_ros.core.estimation.output_error import Problem
-from omsm_ros.core.estimation.steps import (
-    Steps,
-    backlash_columns,
-    find_steps,
-    sample_noise,
-    segments,
-)
+from omsm_ros.core.estimation.steps import Steps, find_steps, sample_noise, segments
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 
@@ -96,14 +90,6 @@ def test_segments_cover_the_record_once_and_hold_one_edge_each() -> None:
     assert all(one[1] == other[0] for one, other in pairwise(cut))
     for (start, stop), (a, b) in zip(cut, PLACES, strict=True):
         assert start < a < b < stop
-
-
-def test_backlash_goes_with_the_direction_of_the_last_move() -> None:
-    columns = backlash_columns(STEPS, len(Z))
-    at_rest = [int(b) + 20 for _, b in PLACES]
-    assert columns[at_rest, 0].tolist() == np.sign(np.diff(LEVELS)).tolist()
-    assert columns[:, 1].sum() == PLACES[0][0]
-    assert not np.any(columns[: PLACES[0][0], 0])
 
 
 # -- noise of samples

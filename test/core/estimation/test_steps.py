@@ -5,13 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.core.estimation.steps import (
-    backlash_columns,
-    extended,
-    find_steps,
-    sample_noise,
-    segments,
-)
+from omsm_ros.core.estimation.steps import extended, find_steps, sample_noise, segments
 from omsm_ros.core.kinematics.trajectories import Chirp, StepTest, s_curve
 from omsm_ros.errors import StepTestError
 
@@ -104,20 +98,6 @@ def test_segments_hold_one_edge_each_and_cover_the_record():
         assert start <= edge.start < edge.stop <= stop
 
 
-def test_backlash_follows_the_direction_of_approach():
-    steps = find_steps(staircase([10e-6, 10e-6, -10e-6, -10e-6]), 1e-3)
-    direction, before = backlash_columns(steps, 2000).T
-    assert direction[1000] == 1
-    assert direction[1700] == -1
-    assert before[0] == 1
-    assert before[1000] == 0
-
-
-def test_steps_of_one_direction_say_nothing_of_backlash():
-    steps = find_steps(staircase([10e-6, 10e-6]), 1e-3)
-    assert backlash_columns(steps, 1200).shape == (1200, 0)
-
-
 def test_four_edges_are_cut_between_and_three_into_equal_parts():
     heights = [10e-6, 10e-6, -10e-6, -10e-6]
     steps = find_steps(staircase(heights), 1e-3)
@@ -137,16 +117,6 @@ def test_an_edge_cut_by_the_end_of_the_record_is_none(cut):
     np.testing.assert_allclose([edge.height for edge in steps.edges], expected, atol=1e-9)
     assert steps.moving[0 if cut == "start" else -1]
     assert not steps.moving[-1 if cut == "start" else 0]
-
-
-def test_backlash_of_an_edge_begins_with_it():
-    steps = find_steps(staircase([10e-6, -10e-6], noise=0.0), 1e-3)
-    direction, before = backlash_columns(steps, 1200).T
-    first, second = steps.edges
-    assert np.array_equal(before, np.arange(1200) < first.start)
-    assert np.all(direction[: first.start] == 0)
-    assert np.all(direction[first.start : second.start] == 1)
-    assert np.all(direction[second.start :] == -1)
 
 
 @settings(max_examples=30)

@@ -228,24 +228,16 @@ class TestWhichFamilies:
         found = ModelErrorFamilies(clean.problem, clean.fitted, endless)
         assert not list(found.families((FRICTION, BACKLASH)))
 
-    def test_steps_all_up_show_a_gap_of_the_motion_and_none_of_the_steps(self, clean):
-        rising = replace(clean.steps, edges=clean.steps.edges[:3])
-        model_errors = ModelErrorFamilies(clean.problem, clean.fitted, rising)
-        names = [family.parameters[0] for family in model_errors.families((BACKLASH,))]
-        assert len(names) == 1
-        assert names[0] > 0
-        assert len(list(clean.model_errors.families((BACKLASH,)))) == 2
-
     def test_friction_and_gap_have_the_size_of_a_force_and_of_a_lead(self, model_errors):
         largest = [
             np.max(abs(family.part(0, len(family.parameters))))
             for family in model_errors.families((FRICTION, BACKLASH))
         ]
-        assert largest == pytest.approx([1.0, 1.0, 1.0], rel=0.01)
+        assert largest == pytest.approx([1.0, 1.0], rel=0.01)
 
     def test_what_a_gap_loses_is_what_the_probe_does_not_follow(self, model_errors, step_test_of):
         """Compare half a backlash of 300 nm with the play operator on the true motion."""
-        (of_travel, _) = model_errors.families((BACKLASH,))
+        (of_travel,) = model_errors.families((BACKLASH,))
         half, state, lost = 150e-9, step_test_of.late[0], []
         for value in step_test_of.late:
             state = min(max(state, value - half), value + half)
