@@ -73,10 +73,11 @@ def test_each_source_is_found_within_its_uncertainty(kind, seeds):
         assert np.sqrt(np.mean(np.square(found))) < 2.5, name
 
 
-def test_a_recording_of_another_kind_is_refused():
+@pytest.mark.parametrize("kind", ["still", "passes"])
+def test_a_recording_of_another_kind_is_refused(kind):
     scan, _ = recording("turned", 0)
     with pytest.raises(DataError, match="the axes do not move as in a recording"):
-        evaluate_sources("still", scan, Flat())
+        evaluate_sources(kind, scan, Flat())
 
 
 def test_the_twin_makes_recordings_of_which_the_command_writes_the_sources(

@@ -7,7 +7,6 @@ its covariance. A jackknife over parts of the recording shows what that model le
 larger of both uncertainties counts.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -86,7 +85,11 @@ def evaluate_sources(
     size = max(
         1, len(view) // min(max(_BLOCKS, round(scan.turns * _BLOCKS_PER_TURN)), _MOST_BLOCKS)
     )
-    averaged = _averages(size, len(view))
+    whole = len(view) // size * size
+
+    def averaged(values: FloatArray) -> FloatArray:
+        return np.asarray(values[:whole].reshape(-1, size).mean(axis=1), np.float64)
+
     columns = [np.atleast_2d(f.columns(view)) for f in families]
     hidden = _inseparable(kind, view, scan.turns)
     model = _Model(
@@ -163,12 +166,6 @@ def _one_linearity(found: list[FoundSource]) -> list[FoundSource]:
     return [*(one for one in found if one not in both), joined]
 
 
-def _averages(size: int, length: int) -> Callable[[FloatArray], FloatArray]:
-    """Return the function that averages ``size`` consecutive values of ``length``."""
-    whole = length // size * size
-    return lambda values: np.asarray(values[:whole].reshape(-1, size).mean(axis=1), np.float64)
-
-
 def _inseparable(kind: str, view: ScanView, turns: float) -> FloatArray:
     """Return columns of the part and of drift, (k, n); the time is the first of STILL and PASSES.
 
@@ -179,7 +176,7 @@ def _inseparable(kind: str, view: ScanView, turns: float) -> FloatArray:
     still = np.ptp(view.x) < 1e-5 and np.ptp(view.y) < 1e-5
     if kind == STILL and still and turns < 1e-3:
         return np.stack([time, one])
-    if kind == PASSES and not still:
+    if kind == PASSES and not still and turns < 1e-3:
         place = np.where(np.ptp(view.slide_x) > 0, view.slide_x, radius)
         nodes = np.linspace(place.min(), place.max(), _HATS)
         return np.stack([time, *(np.interp(place, nodes, hat) for hat in np.eye(_HATS))])
