@@ -15,7 +15,7 @@ from omsm_ros.core.estimation.model_order import Candidate, information
 from omsm_ros.core.estimation.model_order import choose as choose_candidate
 from omsm_ros.core.estimation.noise import correct_errors_in_variables
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
-from omsm_ros.core.estimation.output_error import Fit, Problem, evaluated, fit
+from omsm_ros.core.estimation.output_error import Fit, evaluated, fit
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.model_choice import ChosenModel, keep_better, rechosen
 from omsm_ros.core.lti.transfer_function import Structure
@@ -352,8 +352,8 @@ def _grown(
     if term.family not in (CREEP, MODE):
         return None
     problem, new = prepared.problem, poles_of(term)
-    decays = float(np.min(-new.real)) * len(problem.input) * problem.period
-    if term.family == CREEP or decays < _SETTLED_DECAYS:
+    duration = len(problem.input) * problem.period
+    if term.family == CREEP or np.min(-new.real) * duration < _SETTLED_DECAYS:
         # The response to the end of the record reaches the start of the period.
         problem = replace(problem, fits_initial_condition=True)
     starts = _FASTER if term.family == CREEP else _MODE_FREQUENCY_RATIOS
@@ -362,7 +362,7 @@ def _grown(
     found = [
         Candidate(fitted, information(fitted))
         for fitted in tried
-        if fitted is not None and _decays(fitted, problem)
+        if fitted is not None and np.min(-fitted.dynamics.poles().real) * duration > _LEAST_DECAYS
     ]
     best = min(found, key=lambda candidate: candidate.bic, default=None)
     chosen = model.chosen.fit
@@ -388,8 +388,3 @@ def _bases(model: ChosenModel) -> list[Fit]:
 
 def _plain_candidates(model: ChosenModel) -> list[Candidate]:
     return [c for c in model.candidates if c.fit.structure.poles <= _PLAIN_POLES]
-
-
-def _decays(found: Fit, problem: Problem) -> bool:
-    slowest = float(np.min(-found.dynamics.poles().real))
-    return slowest * len(problem.input) * problem.period > _LEAST_DECAYS

@@ -11,6 +11,7 @@ import numpy as np
 from scipy import fft, stats
 
 from omsm_ros.core.estimation.covariance import autoregression
+from omsm_ros.core.estimation.impulse_response import gram_of
 from omsm_ros.core.estimation.noise import (
     motion_error_variance,
     motion_scatter,
@@ -22,7 +23,6 @@ from omsm_ros.core.estimation.output_error import Fit, Problem
 from omsm_ros.core.estimation.steps import Steps, extended
 from omsm_ros.core.lti.frequency_response import FrequencyResponse, frequency_response
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
-from omsm_ros.linear_algebra import orthonormal
 
 # As resid of the System Identification Toolbox takes.
 _LAGS = 25
@@ -150,11 +150,13 @@ def independence(residual: FloatArray, drive: FloatArray, lags: int = _LAGS) -> 
     The residual is regressed on the last ``lags`` values of the drive, which are correlated;
     so few of its directions count, and only those above rounding are counted.
     """
-    past = np.column_stack([np.roll(drive, lag) for lag in range(lags)])[lags:]
-    basis = orthonormal(past, 1e-6) if np.any(past) else past[:, :0]
-    rest = residual[lags:]
-    statistic = float(np.sum((basis.T @ rest) ** 2)) / float(np.mean(rest**2) or 1.0)
-    return float(stats.chi2.sf(statistic, basis.shape[1])) if basis.shape[1] else 1.0
+    rest = residual[lags - 1 :]
+    gram, moment = gram_of(drive[:, np.newaxis], rest, lags)
+    values, directions = np.linalg.eigh(gram)
+    kept = values > 1e-12 * values[-1]
+    statistic = float(np.sum((directions.T @ moment)[kept] ** 2 / values[kept]))
+    statistic /= float(np.mean(rest**2)) or 1.0
+    return float(stats.chi2.sf(statistic, np.sum(kept))) if np.any(kept) else 1.0
 
 
 def follows_beyond(problem: Problem, fitted: Fit, coarse: Problem) -> float:

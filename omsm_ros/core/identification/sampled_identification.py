@@ -254,12 +254,13 @@ def _compared(
     columns = np.concatenate([driven, [np.ones(len(place)), place]]).T
     scale = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
     columns /= scale
-    inverse = np.linalg.pinv(columns)
+    turned, sizes, directions = np.linalg.svd(columns, full_matrices=False)
+    inverse = directions.conj().T / np.where(sizes > _COLLINEAR, sizes, np.inf) @ turned.conj().T
     solved = inverse @ residual
     left = residual - columns @ solved
     variance = float(np.sum(np.abs(left) ** 2)) / max(len(residual) - columns.shape[1], 1)
     spread = np.sqrt(variance * np.sum(np.abs(inverse) ** 2, axis=1)) / scale
-    if np.linalg.matrix_rank(columns, tol=_COLLINEAR) < columns.shape[1]:
+    if sizes[-1] <= _COLLINEAR:
         spread[:] = np.inf
     inputs, power = len(driven), np.sum(powers, axis=0)
     strong = frequency[power > _STRONG * np.max(power)]
