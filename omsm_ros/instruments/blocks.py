@@ -113,7 +113,7 @@ class BlockCutter:
         self.restarted_at_zero = self.perhaps_at_zero = self.lost_settings = False
         # Device time less that of the count, and arrival, of the last samples [ns].
         self._usual: tuple[int, int] | None = None
-        self._due = self._doubtful = 0  # time by the count; an offset to be confirmed
+        self._due = self._doubtful = self._latest = 0  # time by the count; offset to be confirmed
         self._skipped = 0  # counts left out for missed triggers
         self.unconfirmed = False
         self.delivered = self.withheld = self.blocks = self.period_warnings = self.resets = 0
@@ -273,12 +273,13 @@ class BlockCutter:
         A time that was spoilt on the line is replaced by that of the count.
         """
         times: IntArray = run.samples["time"]
-        counts = run.first_sample + np.arange(len(run.samples))
-        due: IntArray = np.rint(counts * self._settings.sample_period * NANOSECONDS_PER_S).astype(
-            np.int64
-        )
+        due_s = (run.first_sample + np.arange(len(run.samples))) * self._settings.sample_period
+        due: IntArray = np.rint(due_s * NANOSECONDS_PER_S).astype(np.int64)
         if not self._channels.timed:
             return due
+        before, self._latest = self._latest, int(times[-1])
+        if self._latest == before:
+            return times  # the clock of the device stands still, as its rate will show
         usual = int(np.median(times - due))
         if not (run.restarted or after_silence or self._usual is None):
             begun, arrived = self._usual
@@ -313,16 +314,14 @@ class BlockCutter:
         periods = len(samples) - 1
         if periods < max(1, self._settings.block_size - 1):
             return  # too short to distinguish a wrong period from jitter
-        nominal = periods * self._settings.sample_period
         elapsed = (int(samples["time"][-1]) - int(samples["time"][0])) * NANOSECOND_S
-        self.period_deviation = elapsed / nominal - 1
+        self.period_deviation = elapsed / (periods * self._settings.sample_period) - 1
         self.period_warnings += abs(self.period_deviation) > PERIOD_TOLERANCE
         edges = np.unique(np.linspace(0, periods, _PARTS + 1).astype(int))
         parts = np.diff(samples["time"][edges]) * NANOSECOND_S
         off = parts / np.maximum(np.diff(edges) * self._settings.sample_period, NANOSECOND_S) - 1
-        least, most = float(off.min()), float(off.max())
         limit = RATE_TOLERANCE if self._settings.free_running else TRIGGER_TOLERANCE
-        self._evenly_wrong = least > limit or most < -limit
+        self._evenly_wrong = bool(off.min() > limit or off.max() < -limit)
 
     def _blocks(self, samples: Samples, first: int, stamp: int) -> BlockPair:
         common = {

@@ -220,8 +220,9 @@ class StreamDevice:
 
     def _rates(self) -> str:
         period = self._settings.sample_period
-        found = 1 / (period * (1 + self._cutter.period_deviation))
-        return f"{found:.6g} Hz, sample_period states {1 / period:.6g} Hz"
+        found = period * (1 + self._cutter.period_deviation)
+        rate = f"{1 / found:.6g} Hz" if found > 0 else "no rate (its time does not increase)"
+        return f"{rate}, sample_period states {1 / period:.6g} Hz"
 
     @property
     def statistics(self) -> StreamStatistics:

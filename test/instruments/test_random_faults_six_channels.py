@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from types import SimpleNamespace
 from typing import Any
 
@@ -73,9 +74,11 @@ class Ring:
             self.written += 1
         return len(data)
 
-    def read_by_name(self, symbol: str, kind: Any) -> bytes:
+    def read_by_name(self, symbol: str, kind: Any, **_: Any) -> bytes:
         if not self._loop.has_reader:
             raise OSError("no route")
+        if ctypes.sizeof(kind) > 8 + len(self._image):
+            raise OSError("parameter size not correct")
         return self.written.to_bytes(8, "little") + bytes(self._image)
 
 
@@ -124,8 +127,13 @@ def ring_bench(monkeypatch: pytest.MonkeyPatch) -> Any:
         loop = Loopback(interval=options.pop("interval"))
         ring = Ring(loop)
         connected = SimpleNamespace(
-            open=loop.open, close=loop.close, read_by_name=ring.read_by_name
+            open=loop.open,
+            close=loop.close,
+            read_by_name=ring.read_by_name,
+            set_timeout=lambda _: None,
         )
+        router = SimpleNamespace(create_connection=lambda *_: SimpleNamespace(close=lambda: None))
+        monkeypatch.setattr("omsm_ros.instruments.six_channel.device.socket", router)
         fake = SimpleNamespace(Connection=lambda *_: connected, ADSError=OSError)
         monkeypatch.setattr("omsm_ros.instruments.six_channel.device._pyads", lambda: fake)
         driver = device(SimulatedRing(loop), settings, loop.clock.nanoseconds, loop.clock)

@@ -40,6 +40,26 @@ def test_unknown_verdicts_are_counted_and_lost() -> None:
 # Time.
 
 
+@pytest.mark.parametrize("time_ns", [0, 10**18])
+@pytest.mark.parametrize("together", [1, 20])
+def test_a_time_that_stands_still_is_an_error(time_ns: int, together: int) -> None:
+    """A controller whose program does not fill the time in, not one spoilt on the line."""
+    frames, now = frames_of(np.arange(2000)), 0.0
+    frames["device_time"] = time_ns
+    portions = [encode_frames(frames[i : i + together]) for i in range(0, 2000, together)]
+    device = GenericStreamDevice(
+        Script(*portions), StreamSettings(), lambda: 10**18 + round(now * 1e9)
+    )
+    device.open()
+    found = []
+    for _ in portions:
+        now += together * 1e-3
+        found += device.poll(0.0)
+    assert not found
+    assert "its time does not increase" in device.trouble
+    assert device.statistics.restarts == 0
+
+
 def test_stamps_are_of_the_first_sample_on_the_host_clock() -> None:
     """Frames that arrive at the instant they are taken: host = device + a known offset."""
     offset = 1_700_000_000_000_000_000
