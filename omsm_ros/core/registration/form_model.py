@@ -265,7 +265,8 @@ def _upper_variances(sizes: FloatArray, unknown: FloatArray, group: IntArray) ->
             known += by_law
         spread = 2 / (9 * max(known, 1.0))
         upper[chosen] = np.exp(log) * (1 - spread - _QUANTILE * np.sqrt(spread)) ** -3
-    return upper
+    # A conic constant hides the lowest rings, which are as high as other form of their order.
+    return np.where(group == _RINGS, np.maximum(upper, np.max(upper[group == 4], initial=0)), upper)
 
 
 def _power_law(sizes: FloatArray, seen: FloatArray, order: FloatArray) -> tuple[float, float]:

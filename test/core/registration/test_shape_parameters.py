@@ -88,3 +88,19 @@ def test_a_declared_placement_is_never_exceeded_and_saves_the_astigmatism(seed):
     astigmatism = form.zernike.coefficients[place]
     spread = form.zernike.uncertainty[place]
     assert abs(astigmatism - 50e-9) < 3 * spread < 10e-9
+
+
+def test_a_conic_constant_holds_what_spherical_aberration_of_the_part_makes_of_it():
+    """That is as high as the rest of the fourth order, but looks like another conic constant."""
+    u, v = X / R, Y / R
+    s, rng = u * u + v * v, np.random.default_rng(1)
+    others = (u**4 - 6 * u * u * v * v + v**4, 4 * (u**3 * v - u * v**3),
+              (4 * s - 3) * (u * u - v * v), (4 * s - 3) * 2 * u * v)  # fmt: skip
+    height = PosedSurface(Asphere(0.05, -0.8), POSE).height(X, Y) + rng.normal(0, 2e-9, N)
+    height += np.sqrt(10) * 20e-9 * np.array([1, -1, -1, 1]) @ others
+    aberration = np.sqrt(5) * 20e-9 * (6 * s * s - 6 * s + 1)
+    (value, spread), (changed, _) = (
+        fitted(Asphere(0.051, -0.6), h, ("auto", "radius", "conic_constant"))[1]["conic_constant"]
+        for h in (height, height + aberration)
+    )
+    assert 1e-3 < abs(changed - value) < 2 * spread
