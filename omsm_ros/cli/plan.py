@@ -281,6 +281,7 @@ def _show_scans(facts: Facts) -> None:
                 for k, path in enumerate(facts["paths"])
             ),
             ("chosen", f"{facts['set']}, which {reached} {quantity(facts['accuracy'], 'm', 2)}"),
+            ("", "U of PV, by which 'omsm adjust' judges, is two to three times as large"),
             written(facts["files"]),
         ]
     )
