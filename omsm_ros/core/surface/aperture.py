@@ -215,7 +215,8 @@ def best_covered(
     if min(sizes[:2]) < track:
         return 0.0, aperture  # a profile
     middle, radius = smallest_disc(x, y)
-    if free and np.hypot(middle[0] - aperture.x, middle[1] - aperture.y) > track:
+    # The end of a spiral moves the middle by a quarter of a track.
+    if free and np.hypot(middle[0] - aperture.x, middle[1] - aperture.y) > track / 3:
         aperture = Aperture(radius, *middle)
     pitch = max(2 * aperture.radius / _CELLS_ACROSS, track / 2)
     reach = max(_GAP_IN_TRACKS * track, _LEAST_CELLS * pitch) / 2 / pitch
