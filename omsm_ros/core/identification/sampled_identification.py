@@ -161,17 +161,17 @@ def _inflated(
     """
     responses = np.array([other.response(lines * sections.period) for other in choice.others])
     own = [other.order for other in choice.others].index(choice.chosen.fit.order)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        apart = np.log(responses / responses[own])
     # The lowest line of the part of the record on which orders were compared.
     lowest, parts = lines[0] / np.sum(choice.evidence), [np.zeros(1)]
-    for input in range(sections.inputs):
-        band = sections.band(lines, input)
-        low, high = _widest(lines, _narrow(band))
-        known = (lines >= max(low, lowest)) & (lines <= high)
-        for off, spread in ((apart.real, band.gain), (apart.imag, band.phase)):
-            ratio = choice.evidence @ off[:, input] ** 2 / spread**2
-            parts.append(np.log1p(ratio[known & np.isfinite(ratio)]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        apart = np.log(responses / responses[own])
+        for input in range(sections.inputs):
+            band = sections.band(lines, input)
+            low, high = _widest(lines, _narrow(band))
+            known = (lines >= max(low, lowest)) & (lines <= high)
+            for off, spread in ((apart.real, band.gain), (apart.imag, band.phase)):
+                ratio = choice.evidence @ off[:, input] ** 2 / spread**2
+                parts.append(np.log1p(ratio[known & np.isfinite(ratio)]))
     factor = float(np.exp(0.5 * np.mean(np.concatenate(parts))))
     return replace(sections, covariance=factor**2 * np.asarray(sections.covariance)), factor
 

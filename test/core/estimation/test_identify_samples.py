@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from sections_of_polynomials import from_polynomials
 from soaked import soaked
 
 from omsm_ros.core.estimation import sampled_choice
-from omsm_ros.core.estimation.parallel_sections import HOLDS
+from omsm_ros.core.estimation.parallel_sections import HOLDS, ParallelSections
 from omsm_ros.core.estimation.sampled_choice import (
     EXPLORED_ON,
     SampledCandidate,
@@ -116,6 +117,24 @@ def test_an_order_asked_for_is_known_no_better_than_the_free_choice_leaves_open(
     assert low.certificate["order"] == 1
     assert low.certificate["free_order"] == 2
     assert any("was asked for" in text for text in low.certificate["warnings"])
+
+
+def test_another_order_adds_the_square_of_its_difference_by_its_evidence():
+    """A gain known to 1 %, and another order that has 3 % more gain and half of the evidence."""
+    gains = [
+        ParallelSections(
+            hold="band-limited", period=1.0, denominators=np.ones((order, 1)) * [1.0, 0.0],
+            numerators=np.zeros((1, order, 2)), direct=np.array([gain]), delays=np.zeros(1),
+            covariance=np.diag([1e-4, 0.0]) if order == 0 else None,
+        )
+        for order, gain in ((0, 1.0), (1, np.exp(0.03)))
+    ]  # fmt: skip
+    chosen = SimpleNamespace(fit=SimpleNamespace(order=0))
+    choice = SimpleNamespace(chosen=chosen, others=gains, evidence=np.array([0.5, 0.5]))
+    lines = np.geomspace(1e-3, 0.4, 400)
+    widened, factor = sampled_identification._inflated(gains[0], choice, lines)
+    assert factor == pytest.approx(np.sqrt(1 + 0.5 * 3**2), rel=5e-3)
+    np.testing.assert_allclose(widened.band(lines).gain, 0.01 * factor)
 
 
 @pytest.mark.parametrize("hold", ["zero-order", "band-limited"])
