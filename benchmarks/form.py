@@ -31,13 +31,12 @@ from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.placement import PointBatch
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.aperture import Aperture
-from omsm_ros.core.surface.aspheres import Asphere, Toroid
+from omsm_ros.core.surface.aspheres import Asphere, Sphere, Toroid
 from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.nominal import (
     PAPER_MIRROR,
     PAPER_MIRROR_RADIUS_M,
     Flat,
-    Sphere,
     XYPolynomial,
     XYTerm,
     ZernikeSurface,

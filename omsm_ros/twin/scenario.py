@@ -18,12 +18,12 @@ from omsm_ros.core.kinematics.trajectories import (
 )
 from omsm_ros.core.streams.blocks import FloatArray, Status
 from omsm_ros.core.surface.aperture import Aperture
+from omsm_ros.core.surface.aspheres import Sphere
 from omsm_ros.core.surface.nominal import (
     PAPER_MIRROR,
     PAPER_MIRROR_HALF_LENGTH_M,
     PAPER_MIRROR_RADIUS_M,
     Flat,
-    Sphere,
 )
 from omsm_ros.core.surface.posed import Pose, PosedSurface
 from omsm_ros.twin.cell import Cell, Recording, record

@@ -8,8 +8,7 @@ import pytest
 from omsm_ros.cli import main
 from omsm_ros.cli.form import Scan, show_surface
 from omsm_ros.core.kinematics.limits import MachineLimits
-from omsm_ros.core.surface.aspheres import Asphere, Toroid
-from omsm_ros.core.surface.nominal import Sphere
+from omsm_ros.core.surface.aspheres import Asphere, Sphere, Toroid
 from omsm_ros.errors import DataError
 
 SCAN = Scan(0.01, 1e-4, 30.0)

@@ -9,7 +9,8 @@ import pytest
 
 from omsm_ros import cli
 from omsm_ros.core.kinematics.trajectories import Spiral
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, Sphere
+from omsm_ros.core.surface.aspheres import Sphere
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.io import bags, descriptions, files, results
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.twin.cell import Cell, blocks_of, record

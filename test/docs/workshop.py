@@ -9,7 +9,8 @@ import yaml
 
 from omsm_ros import cli
 from omsm_ros.core.kinematics.trajectories import Chirp, Spiral
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, Sphere
+from omsm_ros.core.surface.aspheres import Sphere
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.pipelines.record_bags import write_nominal, write_recording
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.scenario import Scenario, on_a_flat, planned_test_of, scan_of

@@ -9,7 +9,8 @@ import pytest
 
 from omsm_ros.core.kinematics.kinematics import Geometry, workpiece_points
 from omsm_ros.core.kinematics.trajectories import AxisPositions, Circle, Spiral
-from omsm_ros.core.surface.nominal import Flat, Sphere
+from omsm_ros.core.surface.aspheres import Sphere
+from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, Probe, record
 from omsm_ros.twin.disturbances import Disturbances

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.streams.blocks import Status
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, Sphere
+from omsm_ros.core.surface.aspheres import Sphere
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.probe import LEVEL, Probe, ProbeErrors, Slope, read, slope_of
 

@@ -93,6 +93,22 @@ class Asphere(CheckedRecord):
 
 
 @dataclass(frozen=True, slots=True)
+class Sphere(CheckedRecord):
+    """A sphere of ``radius`` [m] touching the plane at the origin; concave if positive."""
+
+    radius: float = field(metadata=RADIUS.metadata)
+    error = SurfaceError
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height [m] at x, y [m]; NaN from the equator on."""
+        return Asphere(self.radius).height(x, y)
+
+    def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]; NaN from the equator on."""
+        return Asphere(self.radius).gradient(x, y)
+
+
+@dataclass(frozen=True, slots=True)
 class Toroid(CheckedRecord):
     """A conic in the plane of y and z, rotated about a line parallel to y above its vertex.
 

@@ -18,6 +18,7 @@ from omsm_ros.core.surface.aspheres import (
     Asphere,
     Biconic,
     Series,
+    Sphere,
     Toroid,
     bfs_series,
     checked_terms,
@@ -328,22 +329,6 @@ class Flat(CheckedRecord):
         """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         zero = np.zeros(np.broadcast(x, y).shape)
         return zero, zero
-
-
-@dataclass(frozen=True, slots=True)
-class Sphere(CheckedRecord):
-    """A sphere of ``radius`` [m] touching the plane at the origin; concave if positive."""
-
-    radius: float = field(metadata=RADIUS.metadata)
-    error = SurfaceError
-
-    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the height [m] at x, y [m]; NaN from the equator on."""
-        return Asphere(self.radius).height(x, y)
-
-    def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Return the slopes ∂z/∂x, ∂z/∂y [1]; NaN from the equator on."""
-        return Asphere(self.radius).gradient(x, y)
 
 
 @dataclass(frozen=True, slots=True)

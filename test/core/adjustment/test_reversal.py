@@ -15,7 +15,8 @@ from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
+from omsm_ros.core.surface.aspheres import Sphere
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.errors import DataError
 from omsm_ros.pipelines.recording import scan_data
 from omsm_ros.twin.cell import Cell, record

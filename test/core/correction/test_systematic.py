@@ -10,7 +10,8 @@ import pytest
 from omsm_ros.core.correction.source_kinds import KINDS, SystematicSource, standard_fields
 from omsm_ros.core.correction.systematic import DECLARED, ScanPoints
 from omsm_ros.core.kinematics.kinematics import Geometry, workpiece_points
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
+from omsm_ros.core.surface.aspheres import Sphere
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.twin.machine_errors import Harmonic, SpindleError
 from omsm_ros.twin.part import MountedSurface, PartPose

@@ -25,7 +25,8 @@ from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.lti.discretisation import discretise
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, Sphere
+from omsm_ros.core.surface.aspheres import Sphere
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.plant import PAPER_EQ_12
 

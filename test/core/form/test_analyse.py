@@ -7,7 +7,8 @@ from soaked import soaked
 from omsm_ros.core.form.analyse import analyse_form
 from omsm_ros.core.registration.placement import PointBatch
 from omsm_ros.core.surface.aperture import Aperture
-from omsm_ros.core.surface.nominal import Flat, Sphere
+from omsm_ros.core.surface.aspheres import Sphere
+from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import DataError
 
 RNG = np.random.default_rng(6)

@@ -6,7 +6,8 @@ import pytest
 from omsm_ros.core.form.analyse import analyse_form
 from omsm_ros.core.registration.placement import PointBatch
 from omsm_ros.core.surface.aperture import Aperture
-from omsm_ros.core.surface.nominal import Sphere, ZernikeSurface
+from omsm_ros.core.surface.aspheres import Sphere
+from omsm_ros.core.surface.nominal import ZernikeSurface
 from omsm_ros.core.surface.posed import Sum
 
 RADIUS = 12.7e-3

@@ -21,8 +21,8 @@ from omsm_ros.core.kinematics.trajectories import (
     plan_steps,
     s_curve,
 )
-from omsm_ros.core.surface.aspheres import Toroid
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
+from omsm_ros.core.surface.aspheres import Sphere, Toroid
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.gcode_file import steps_gcode
 

@@ -15,7 +15,7 @@ from omsm_ros.core.correction.systematic import ScanTrace
 from omsm_ros.core.kinematics.kinematics import Geometry, workpiece_points
 from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.registration.probe_alignment import SphereScan, align_on_sphere
-from omsm_ros.core.surface.nominal import Sphere
+from omsm_ros.core.surface.aspheres import Sphere
 from omsm_ros.errors import DataError
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant

@@ -9,7 +9,8 @@ from omsm_ros.core.registration.placement import POSE_PARAMETERS, PointBatch
 from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.core.registration.register import register
 from omsm_ros.core.surface.aperture import Aperture
-from omsm_ros.core.surface.nominal import Sphere, ZernikeSurface
+from omsm_ros.core.surface.aspheres import Sphere
+from omsm_ros.core.surface.nominal import ZernikeSurface
 from omsm_ros.core.surface.posed import Sum
 from omsm_ros.twin.part import PartPose, mounted_surface
 

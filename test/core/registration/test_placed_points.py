@@ -17,9 +17,9 @@ from omsm_ros.core.registration.placement import (
     selection,
 )
 from omsm_ros.core.surface.aperture import Aperture
-from omsm_ros.core.surface.aspheres import Asphere, Toroid
+from omsm_ros.core.surface.aspheres import Asphere, Sphere, Toroid
 from omsm_ros.core.surface.height_grid import gradient_of, unit_normal
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.core.surface.posed import Pose
 from omsm_ros.errors import DataError
 

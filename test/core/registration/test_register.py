@@ -19,15 +19,8 @@ from omsm_ros.core.registration.placement import (
 from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.core.registration.register import register
 from omsm_ros.core.surface.aperture import Aperture
-from omsm_ros.core.surface.aspheres import Asphere, Toroid
-from omsm_ros.core.surface.nominal import (
-    PAPER_MIRROR,
-    Flat,
-    Sphere,
-    XYPolynomial,
-    XYTerm,
-    ZernikeSurface,
-)
+from omsm_ros.core.surface.aspheres import Asphere, Sphere, Toroid
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, XYPolynomial, XYTerm, ZernikeSurface
 from omsm_ros.core.surface.posed import Pose, Sum
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.twin.part import FigureError, PartPose, mounted_surface

@@ -7,8 +7,8 @@ from soaked import soaked
 from omsm_ros.core.form.analyse import analyse_form
 from omsm_ros.core.registration.placement import PointBatch
 from omsm_ros.core.registration.register import register
-from omsm_ros.core.surface.aspheres import Asphere, Toroid
-from omsm_ros.core.surface.nominal import OffAxisParaboloid, Sphere
+from omsm_ros.core.surface.aspheres import Asphere, Sphere, Toroid
+from omsm_ros.core.surface.nominal import OffAxisParaboloid
 from omsm_ros.core.surface.posed import Pose, PosedSurface
 from omsm_ros.core.surface.shape_parameters import external
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from omsm_ros.core.surface import deviation as form
 from omsm_ros.core.surface.area_weights import area_weights
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat, Sphere
+from omsm_ros.core.surface.aspheres import Sphere
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat
 from omsm_ros.errors import DataError
 
 RADIUS = 12.7e-3

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from omsm_ros.core.surface import deviation as form
-from omsm_ros.core.surface.nominal import Flat, Sphere
+from omsm_ros.core.surface.aspheres import Sphere
+from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.core.surface.posed import Pose, PosedSurface
 from omsm_ros.errors import DataError
 

@@ -8,15 +8,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from omsm_ros.core.surface.aspheres import Asphere, Biconic, Toroid
-from omsm_ros.core.surface.nominal import (
-    OffAxisParaboloid,
-    QBfs,
-    QCon,
-    Sphere,
-    XYPolynomial,
-    XYTerm,
-)
+from omsm_ros.core.surface.aspheres import Asphere, Biconic, Sphere, Toroid
+from omsm_ros.core.surface.nominal import OffAxisParaboloid, QBfs, QCon, XYPolynomial, XYTerm
 
 RNG = np.random.default_rng(7)
 X, Y = RNG.uniform(-8e-3, 8e-3, (2, 60))

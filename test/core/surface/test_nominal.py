@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, OffAxisParaboloid, Sphere
+from omsm_ros.core.surface.aspheres import Sphere
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, OffAxisParaboloid
 from omsm_ros.errors import SurfaceError
 
 RNG = np.random.default_rng(0)

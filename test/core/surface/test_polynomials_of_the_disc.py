@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from scipy import special
 
-from omsm_ros.core.surface.aspheres import bfs_series, con_series, freeform_series
+from omsm_ros.core.surface.aspheres import Sphere, bfs_series, con_series, freeform_series
 from omsm_ros.core.surface.nominal import (
     QBfs,
     QCon,
     QFreeform,
     QTerm,
-    Sphere,
     XYPolynomial,
     XYTerm,
     ZernikeSurface,

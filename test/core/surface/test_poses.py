@@ -8,13 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from omsm_ros.core.surface.aspheres import Asphere, Toroid
+from omsm_ros.core.surface.aspheres import Asphere, Sphere, Toroid
 from omsm_ros.core.surface.height_grid import gradient_of, unit_normal
 from omsm_ros.core.surface.nominal import (
     PAPER_MIRROR,
     Flat,
     OffAxisParaboloid,
-    Sphere,
     XYPolynomial,
     XYTerm,
 )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from omsm_ros.core.surface.aspheres import Asphere, Biconic, Toroid
+from omsm_ros.core.surface.aspheres import Asphere, Biconic, Sphere, Toroid
 from omsm_ros.core.surface.height_grid import gradient_of
 from omsm_ros.core.surface.nominal import (
     PAPER_MIRROR,
@@ -14,7 +14,6 @@ from omsm_ros.core.surface.nominal import (
     QCon,
     QFreeform,
     QTerm,
-    Sphere,
     XYPolynomial,
     XYTerm,
     ZernikeSurface,
