@@ -6,9 +6,13 @@ TEMPLATES = catalogue("""
 kinematics.pitch: positions of the pitch do not increase; sort them, each once, two or more
 # Path of a scan
 kinematics.left_out: only {judged:count} of {samples:count} samples are judged, triggers {first} to
-    {last}{runs}{most}
-kinematics.runs: , the longest of {runs} runs without a gap, a lost Z or a restart of the counter
+    {last}{gaps}{most}
+kinematics.longest_run: , the longest run without a gap: {gaps:list}
 kinematics.most: ; at most the first {most:count} are used
+kinematics.gap: {samples:count} are missing ({first} to {last})
+kinematics.reset: after {last} the counter continues from {first}
+kinematics.period: from {first} on the sample period is {period:.6g} s
+kinematics.more_gaps: {gaps} more gaps
 # Trajectories
 kinematics.multisine: multisine: {periods} periods and {realisations} realisations, expected 2 or
     more of each; up to {up_to} Hz, expected {least:.3g} to {most:.3g} Hz

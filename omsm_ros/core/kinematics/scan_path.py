@@ -1,6 +1,7 @@
 """Path of a scan, with the bandwidth and the derivatives of its Z motion."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.polynomial import Legendre
@@ -16,6 +17,8 @@ from omsm_ros.core.streams.blocks import (
 )
 from omsm_ros.errors import Notice
 
+# Number of gaps that a message names.
+_MOST_NAMED = 3
 # Share of the mean square velocity that defines the bandwidth; the rest may be encoder noise.
 _CONTENT_SHARE = 0.999
 # Length from which the end of a record is cut to a length with small prime factors, whose Fourier
@@ -68,7 +71,7 @@ class ScanPathReader:
             self._readings_kept += len(block)
 
     def _keep(self, block: AxisBlock) -> None:
-        if not self._runs or not _continues(self._runs[-1][-1], block):
+        if not self._runs or _break(self._runs[-1][-1], block):
             self._runs.append([])
         self._runs[-1].append(block)
         self._kept += len(block)
@@ -97,23 +100,33 @@ class ScanPathReader:
         )
 
     def _left_out(self, first: int, judged: int) -> Notice | None:
-        if judged == self._passed and len(self._runs) == 1:
+        breaks = [_break(before[-1], after[0]) for before, after in pairwise(self._runs)]
+        named = [gap for gap in breaks[:_MOST_NAMED] if gap is not None]
+        if judged == self._passed and not breaks:
             return None
+        if len(breaks) > _MOST_NAMED:
+            named.append(Notice("kinematics.more_gaps", gaps=len(breaks) - _MOST_NAMED))
         return Notice(
             "kinematics.left_out",
             judged=judged,
             samples=self._passed,
             first=first,
             last=first + judged - 1,
-            runs="" if len(self._runs) == 1 else Notice("kinematics.runs", runs=len(self._runs)),
+            gaps=Notice("kinematics.longest_run", gaps=named) if named else "",
             most=Notice("kinematics.most", most=self._most) if self._passed > self._most else "",
         )
 
 
-def _continues(last: AxisBlock, block: AxisBlock) -> bool:
-    """Return whether ``block`` follows on ``last`` in count and sample period."""
-    alike = abs(block.sample_period / last.sample_period - 1) < SAME_PERIOD
-    return alike and block.first_sample == last.end
+def _break(last: AxisBlock, block: AxisBlock) -> Notice | None:
+    """Return what separates two blocks; None if one continues the other."""
+    end, first = last.end, block.first_sample
+    if first > end:
+        return Notice("kinematics.gap", samples=first - end, first=end, last=first - 1)
+    if first < end:
+        return Notice("kinematics.reset", last=end - 1, first=first)
+    if abs(block.sample_period / last.sample_period - 1) >= SAME_PERIOD:
+        return Notice("kinematics.period", first=end, period=block.sample_period)
+    return None
 
 
 def content_frequency(z: FloatArray, sample_period: float) -> float:

@@ -45,8 +45,8 @@ def test_the_longest_run_is_taken_where_there_is_a_gap() -> None:
     np.testing.assert_array_equal(found.z, Z[220:900])
     np.testing.assert_array_equal(found.distance, -Z[220:900])
     assert str(found.left_out) == (
-        "only 680 of 780 samples are judged, triggers 220 to 899, the longest of 2 runs without a "
-        "gap, a lost Z or a restart of the counter"
+        "only 680 of 780 samples are judged, triggers 220 to 899, the longest run without a gap: "
+        "120 are missing (100 to 219)"
     )
 
 
@@ -60,16 +60,20 @@ def test_the_longest_run_is_taken_where_z_was_lost() -> None:
     np.testing.assert_array_equal(found.z, Z[301:900])
     np.testing.assert_array_equal(found.distance, -Z[301:900])
     assert str(found.left_out) == (
-        "only 599 of 900 samples are judged, triggers 301 to 899, the longest of 3 runs without a "
-        "gap, a lost Z or a restart of the counter"
+        "only 599 of 900 samples are judged, triggers 301 to 899, the longest run without a gap: "
+        "2 are missing (100 to 101), 1 are missing (300 to 300)"
     )
     assert path_of(replace(axes(0, 100), z=np.full(100, np.nan))) is None
 
 
-def test_a_counter_that_restarts_is_another_path() -> None:
-    found = path_of(axes(0, 300), axes(0, 100))
-    np.testing.assert_array_equal(found.z, Z[:300])
-    assert "the longest of 2 runs" in str(found.left_out)
+def test_each_kind_of_break_is_named_and_of_many_three() -> None:
+    found = path_of(axes(0, 300), replace(axes(300, 350), sample_period=2e-3), axes(0, 100))
+    assert (
+        "from 300 on the sample period is 0.002 s, after 349 the counter continues from 0"
+        in str(found.left_out)
+    )
+    found = path_of(*(axes(k, k + 50) for k in range(0, 600, 100)))
+    assert str(found.left_out).endswith("50 are missing (250 to 299), 2 more gaps")
 
 
 def test_another_period_is_another_path() -> None:
