@@ -34,9 +34,6 @@ RADIUS_CELLS = 2.4
 """Radius of a local fit in sides of a cell: about eighteen cells for six coefficients."""
 # One and a half times the six coefficients of a quadratic.
 _LEAST_NEIGHBOURS = 9
-# At the straight edge of evenly spread cells the tricube-weighted centre is 0.30 radii inside; at
-# a larger offset a fit extrapolates.
-_LARGEST_OFFSET = 0.36
 # Largest variance of a value over that of the mean of one cell: 1/3 amid the points, more where
 # the quadratic extrapolates.
 _LARGEST_GAIN = 1.0
@@ -272,7 +269,7 @@ class LocalQuadratic:
     def _shares(
         self, x: FloatArray, y: FloatArray, radius: float
     ) -> tuple[BoolArray, FloatArray, IntArray]:
-        """Return which places (m,) cells surround, and the weights (g, 3, k) of cells (g, k) there.
+        """Return which places (m,) have enough cells, and weights (g, 3, k) of their cells (g, k).
 
         Weights in the value and in both slopes times the radius.
         """
@@ -288,22 +285,10 @@ class LocalQuadratic:
         weight *= cells.points[index] / (cells.points[index] + np.median(cells.points))
         u = np.where(inside, (cells.x[index] - x[:, None]) / radius, 0.0)
         v = np.where(inside, (cells.y[index] - y[:, None]) / radius, 0.0)
-        good = self._surrounded(u, v, weight, inside)
+        good = np.asarray(inside.sum(axis=1) >= _LEAST_NEIGHBOURS, np.bool_)
         chosen = index[good]
         moments = [m[chosen] / radius**2 for m in (cells.xx, cells.xy, cells.yy)]
         return good, _first_rows(u[good], v[good], moments, weight[good]), chosen
-
-    @staticmethod
-    def _surrounded(
-        u: FloatArray, v: FloatArray, weight: FloatArray, inside: BoolArray
-    ) -> BoolArray:
-        """Return where the cells surround the place, and do not lie along one line."""
-        total = np.maximum(weight.sum(axis=1), np.finfo(np.float64).tiny)
-        centre = np.hypot((weight * u).sum(axis=1), (weight * v).sum(axis=1)) / total
-        uu, vv, uv = ((weight * p).sum(axis=1) / total for p in (u * u, v * v, u * v))
-        flat = uu * vv - uv**2 > 1e-3 * (uu + vv) ** 2
-        enough = inside.sum(axis=1) >= _LEAST_NEIGHBOURS
-        return np.asarray(enough & flat & (centre < _LARGEST_OFFSET), np.bool_)
 
 
 def _first_rows(

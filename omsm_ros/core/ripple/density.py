@@ -163,8 +163,6 @@ def noise_floor(power: FloatArray, oversampling: int = 1) -> FloatArray:
         half = int(np.clip(_RELATIVE_WIDTH * centre, narrow, broad))
         low, high = max(centre - half, 0), min(centre + half + 1, count)
         level[place] = np.median(power[low:high])
-    # A band with many lines must not raise the floor of its neighbours.
-    level = np.minimum(level, scipy.ndimage.median_filter(level, 5, mode="nearest") * 4)
     tiny = np.finfo(float).tiny
     logs = np.interp(np.arange(count), centres, np.log(np.maximum(level, tiny)))
     return np.asarray(np.exp(logs) / _MEDIAN_OVER_MEAN)

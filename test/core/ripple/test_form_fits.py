@@ -146,6 +146,15 @@ class TestOrders:
         # For white noise on a circle the bound is that of a sum of cosines.
         assert order.uncertainty == pytest.approx(1 * NM * np.sqrt(2 / COUNT), rel=0.1, abs=0)
 
+    def test_an_order_that_only_cancels_form_on_a_narrow_ring_is_form(self):
+        """With a bump on the part, order and form of two waves a turn are 140 nm with two signs."""
+        signal = scan(inner=0.97)
+        rho, angle = place(signal)
+        away = (rho * np.cos(angle) - 0.67) ** 2 + (rho * np.sin(angle)) ** 2
+        bump = 300 * NM * np.exp(-away / (2 * 0.33**2))
+        found = without_form(replace(signal, height=signal.height + bump))
+        assert max(one.amplitude for one in found.orders) < 40 * NM
+
     def test_orders_go_to_twelve(self):
         assert {one.order for one in without_form(scan()).orders} <= set(range(2, 13))
 
