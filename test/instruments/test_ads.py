@@ -70,8 +70,8 @@ def plc():
     made.server.stop()
     made.server.join(timeout=5.0)
     made.server.server.close()
-    for client in made.server.clients:
-        client.client.close()
+    for client in made.server.clients:  # those that came while it stopped
+        client.close()
 
 
 @pytest.fixture
