@@ -56,8 +56,10 @@ def next_steps(verdict: Mapping[str, Any]) -> list[str]:
     steps = [reason["text"] for reason in verdict["reasons"]]
     doubts = sum(reason["code"] == "recording" for reason in verdict["reasons"])
     if (add := verdict.get("add")) is not None and verdict["code"] != "contradicted":
-        reached = add["reached"]
-        then = "" if reached is None else f": then U = {quantity(reached, 'm', 2)} (rms, k = 2)"
+        then = ""
+        if add["reached"] is not None:
+            rms = quantity(add["reached"], "m", 2)
+            then = f": then U = {rms} (rms, k = 2), of PV two to three times that"
         steps.insert(doubts, f"next: {add['text']}, and run 'omsm adjust' with both scans{then}")
     if verdict["code"] == "verified":
         steps.append("the scans agree, and no declared source is refuted")
