@@ -10,7 +10,7 @@ _omsm_problem=
 if [ ! -x "$_omsm_root/.venv/bin/python" ]; then
     _omsm_problem="$_omsm_root has no .venv yet: run 'make setup', and source me in that folder"
 elif [ ! -d "$_omsm_root/.venv/share/rclpy" ] && [ -z "$("$_omsm_root/bootstrap/distribution.sh")" ]; then
-    _omsm_problem="set up on top of a ROS 2 Jazzy distribution: source its setup.sh first"
+    _omsm_problem="set up on top of a ROS 2 distribution: source its setup.sh first"
 fi
 if [ -n "$_omsm_problem" ]; then
     echo "env.sh: $_omsm_problem" >&2

@@ -1,7 +1,7 @@
 #!/bin/sh
-# Print the prefix of a sourced ROS 2 Jazzy distribution, or nothing.
+# Print the prefix of a sourced ROS 2 distribution, Jazzy or a later one, or nothing.
 # Its mark is rclcpp: the wheels from PyPI, which env.sh also puts on AMENT_PREFIX_PATH, have none.
-[ "${ROS_DISTRO-}" = jazzy ] || exit 0
+case "${ROS_DISTRO-}" in jazzy | kilted | lyrical) ;; *) exit 0 ;; esac
 IFS=:
 for prefix in ${AMENT_PREFIX_PATH-}; do
     if [ -e "$prefix/share/rclcpp/package.xml" ]; then

@@ -21,10 +21,13 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LAUNCHED_BY = "OMSM_LAUNCHED_BY"
 """Variable with the process number of the launch that started a node, which ends with it."""
 
-_PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+# Variable of the profile, and its file in the folder that is read if it exists, of Fast DDS 3
+# (Kilted and later) and 2; each complains of the other's profile.
+_PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+_PROFILES_OF_FOLDER = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
+_WITH_FAST_DDS_2 = ("", "jazzy")
 _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-_PROFILES_OF_FOLDER = "DEFAULT_FASTRTPS_PROFILES.xml"  # read by Fast DDS if it exists
-_TRANSPORTS_CHOSEN = (_PROFILES, "FASTDDS_BUILTIN_TRANSPORTS")
+_TRANSPORTS_CHOSEN = (*_PROFILES, "FASTDDS_BUILTIN_TRANSPORTS")
 _MORE_FROM_PROFILE = "RMW_FASTRTPS_USE_QOS_FROM_XML"  # also memory and publication mode
 _PUBLICATION_MODE = "RMW_FASTRTPS_PUBLICATION_MODE"
 _BAD_INPUT = 2
@@ -105,7 +108,8 @@ def set_up_fast_dds() -> None:
     """Let Fast DDS use our profile (``fast_dds.xml``), unless the user has chosen another.
 
     With ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` it is ``fast_dds_local.xml``, which uses the
-    loopback interface only: otherwise another computer reaches a node by ``ROS_STATIC_PEERS``.
+    loopback interface only: otherwise another computer reaches a node by ``ROS_STATIC_PEERS``. Fast
+    DDS 3 has files of its own (``fast_dds_3.xml``).
 
     Messages use UDP. With shared memory, a subscriber that pauses for a second or two loses its
     queue, while its messages keep their places in the publisher's segment; once that is fragmented,
@@ -119,10 +123,11 @@ def set_up_fast_dds() -> None:
     as its largest message, and each backlog adds places.
     """
     chosen = any(os.environ.get(name) for name in _TRANSPORTS_CHOSEN)
-    if not chosen and not Path(_PROFILES_OF_FOLDER).exists():
+    if not chosen and not any(Path(name).exists() for name in _PROFILES_OF_FOLDER):
+        second = os.environ.get("ROS_DISTRO", "") in _WITH_FAST_DDS_2
         local = os.environ.get(_RANGE, "").strip().upper() == "LOCALHOST"
-        profile = "fast_dds_local.xml" if local else "fast_dds.xml"
-        os.environ[_PROFILES] = str(Path(__file__).with_name(profile))
+        profile = f"fast_dds{'' if second else '_3'}{'_local' if local else ''}.xml"
+        os.environ[_PROFILES[second]] = str(Path(__file__).with_name(profile))
         if not os.environ.get(_PUBLICATION_MODE):
             os.environ.setdefault(_MORE_FROM_PROFILE, "1")
     _send_from_own_thread()

@@ -9,6 +9,7 @@ import pytest
 from omsm_ros.nodes import start
 
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+LATER_PROFILES = "FASTDDS_DEFAULT_PROFILES_FILE"
 MORE = "RMW_FASTRTPS_USE_QOS_FROM_XML"
 MODE = "RMW_FASTRTPS_PUBLICATION_MODE"
 
@@ -16,7 +17,8 @@ MODE = "RMW_FASTRTPS_PUBLICATION_MODE"
 @pytest.fixture(autouse=True)
 def nothing_chosen(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    for name in (PROFILES, MORE, MODE, "FASTDDS_BUILTIN_TRANSPORTS"):
+    monkeypatch.setenv("ROS_DISTRO", "jazzy")
+    for name in (PROFILES, LATER_PROFILES, MORE, MODE, "FASTDDS_BUILTIN_TRANSPORTS"):
         monkeypatch.setenv(name, "")  # to be put back as it was
         monkeypatch.delenv(name)
 
@@ -56,6 +58,23 @@ def test_fast_dds_is_configured_for_its_transports_and_to_release_memory():
     # The other place where the mode stands must say the same.
     mode = [each.text for each in said("data_writer", "{*}publishMode/{*}kind")]
     assert mode == [os.environ[MODE]]
+
+
+@pytest.mark.parametrize("distribution", ["jazzy", "kilted"])
+def test_each_release_of_fast_dds_has_a_profile_of_the_loopback_interface(
+    monkeypatch, distribution
+):
+    """Fast DDS 3 reads another variable, and refuses a profile with the names of Fast DDS 2."""
+    monkeypatch.setenv("ROS_DISTRO", distribution)
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    start.set_up_fast_dds()
+    (name,) = {PROFILES, LATER_PROFILES} & set(os.environ)
+    assert name == (PROFILES if distribution == "jazzy" else LATER_PROFILES)
+    profile = ElementTree.parse(os.environ[name])
+    addresses = profile.findall(".//{*}interfaceWhiteList/{*}address")
+    assert [each.text for each in addresses] == ["127.0.0.1"]
+    limits = profile.findall(".//{*}throughputController")
+    assert len(limits) == (distribution == "jazzy")
 
 
 def test_transports_that_the_user_has_chosen_stay(monkeypatch):
