@@ -442,7 +442,7 @@ def _missing_pairs(problem: SectionsProblem, fitted: SectionsFit, count: int) ->
 
 def _inverse(gram: FloatArray) -> FloatArray:
     """Return the inverse of the products of columns, without directions that are rounding."""
-    scale = np.sqrt(np.diag(gram))
+    scale = np.sqrt(np.maximum(np.diag(gram), 0.0))  # rounding may leave less than nothing
     scale[scale == 0] = 1.0
     values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
     kept = values > _RANK_TOLERANCE * values[-1]
@@ -452,7 +452,7 @@ def _inverse(gram: FloatArray) -> FloatArray:
 
 def _sandwich(gram: FloatArray, score: FloatArray) -> FloatArray:
     """Return gram⁻¹ score gram⁻¹; a direction lost in rounding is as uncertain as the weakest."""
-    scale = np.sqrt(np.diag(gram))
+    scale = np.sqrt(np.maximum(np.diag(gram), 0.0))  # rounding may leave less than nothing
     scale[scale == 0] = 1.0
     values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
     inverse = directions / np.maximum(values, _RANK_TOLERANCE * values[-1]) @ directions.T

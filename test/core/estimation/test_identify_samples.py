@@ -10,7 +10,7 @@ from scipy import signal
 from sections_of_polynomials import from_polynomials
 from soaked import soaked
 
-from omsm_ros.core.estimation import sampled_choice
+from omsm_ros.core.estimation import sampled_choice, sampled_fit
 from omsm_ros.core.estimation.parallel_sections import HOLDS, ParallelSections
 from omsm_ros.core.estimation.sampled_choice import (
     EXPLORED_ON,
@@ -462,3 +462,8 @@ def test_a_delay_that_a_few_poles_imitate_is_not_taken():
     certificate = identified(u, y, 1.0, hold="first-order").certificate
     assert certificate["delay_samples"] == [0.0]
     assert certificate["order"] == 5
+
+
+def test_a_column_that_rounding_leaves_less_than_nothing_is_ignored():
+    gram = np.array([[4.0, 0.0], [0.0, -1e-30]])
+    np.testing.assert_allclose(sampled_fit._inverse(gram), [[0.25, 0.0], [0.0, 0.0]])
