@@ -45,9 +45,9 @@ class StateReport:
         silent: time since the last sample [s];  None = before the first: add ``never`` if any
         period: usual time between two samples [s]
         """
-        if silent is None:
-            self.findings += [(STALE, never)] * bool(never)
-        elif silent > max(_SILENCE_S, _SILENCE_PERIODS * period):
+        if silent is None and never:
+            self.add(STALE, never)
+        elif silent is not None and silent > max(_SILENCE_S, _SILENCE_PERIODS * period):
             self.add(STALE, text.format(silent))
 
     @property

@@ -21,8 +21,7 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LAUNCHED_BY = "OMSM_LAUNCHED_BY"
 """Variable with the process number of the launch that started a node, which ends with it."""
 
-# Variable of the profile, and its file in the folder that is read if it exists, of Fast DDS 3
-# (Kilted and later) and 2; each complains of the other's profile.
+# Fast DDS 3 (Kilted and later) and 2 have profiles of their own, and refuse the other's.
 _PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 _PROFILES_OF_FOLDER = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 _WITH_FAST_DDS_2 = ("", "jazzy")
@@ -108,8 +107,7 @@ def set_up_fast_dds() -> None:
     """Let Fast DDS use our profile (``fast_dds.xml``), unless the user has chosen another.
 
     With ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` it is ``fast_dds_local.xml``, which uses the
-    loopback interface only: otherwise another computer reaches a node by ``ROS_STATIC_PEERS``. Fast
-    DDS 3 has files of its own (``fast_dds_3.xml``).
+    loopback interface only: otherwise another computer reaches a node by ``ROS_STATIC_PEERS``.
 
     Messages use UDP. With shared memory, a subscriber that pauses for a second or two loses its
     queue, while its messages keep their places in the publisher's segment; once that is fragmented,

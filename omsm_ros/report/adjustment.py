@@ -130,7 +130,7 @@ def found_text(source: Mapping[str, Any]) -> str:
     """Return the found value with its uncertainty, or that these scans do not show it."""
     if not source["identifiable"]:
         return "not identifiable from these scans"
-    # Of one component, as it is declared.
+    # A declaration holds for one component, so the mean square over the components is compared.
     size, spread = (float(np.sqrt(np.mean(np.square(source[k])))) for k in ("found", "uncertainty"))
     return measured(size, spread, "" if source["unit"] == "1" else source["unit"])
 

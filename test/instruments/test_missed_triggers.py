@@ -311,7 +311,7 @@ def cut(
 
 @pytest.mark.parametrize("level", [0.0, 0.01])
 @pytest.mark.parametrize("at", [0.6, 5.9])
-def test_a_missed_trigger_is_detected_at_the_start_and_beside_pauses_of_the_host(
+def test_a_missed_trigger_is_detected_at_the_start_and_near_pauses_of_the_host(
     at: float, level: float
 ) -> None:
     counts, triggers, cutter = cut(missed_at=at, stall=6.0, level=level)

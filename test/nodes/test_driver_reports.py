@@ -153,7 +153,7 @@ def test_a_driver_of_axes_alone_passes_over_distances(driver):
 
 @pytest.mark.parametrize("axes", [None, ()])
 def test_a_driver_publishes_axes_only_if_its_device_has_some(driver, axes):
-    # Else beside the driver of the axes two nodes would publish them, and both would warn for ever.
+    # The driver of the axes publishes them too: two publishers of one topic are warned of.
     device = SimpleNamespace(channels=Channels(axes=axes))
     driver._make, driver._settings_topic = lambda values, now: device, ""
     driver.get_logger = lambda: SimpleNamespace(info=None, warning=None)

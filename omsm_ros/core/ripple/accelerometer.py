@@ -19,7 +19,7 @@ PROBE, SLIDE = "probe", "carriage"
 """Mount of the accelerometer: on the probe, not measured by the encoder, or on the slide."""
 
 LARGEST_GAIN = 30.0
-"""Largest ratio of a line in the heights to the motion a/ω² that causes it, and of that to it."""
+"""Largest ratio of a line in the heights to the motion a/ω² that causes it."""
 
 # A line is spread over ±4 resolutions by the window; four times as many make a band.
 _LEAST_RESOLUTIONS = 16

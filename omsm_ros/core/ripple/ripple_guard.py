@@ -42,6 +42,8 @@ from omsm_ros.errors import Notice
 
 # Relative change of pace that moves a line of fifty waves by one; a smaller one decides nothing.
 _SAME_PACE = 0.02
+# Least amplitude of a line over a/ω² of the acceleration that causes it.
+_LEAST_AMPLITUDE_RATIO = 0.1
 # Uncertainty of the frequency of an order, in resolutions.
 _OF_AN_ORDER = 0.25
 # Distance in resolutions below which a line and an order are not fitted separately.
@@ -301,7 +303,7 @@ def _matching_acceleration_line(scan: StudiedScan, line: SpectralLine) -> Accele
         for one in scan.acceleration_lines.lines
         if abs(float(aliased_frequency(one.frequency, rate)) - seen)
         <= tolerance + 4 * one.frequency_uncertainty
-        and 1 / LARGEST_GAIN <= one.displacement / line.amplitude <= LARGEST_GAIN
+        and _LEAST_AMPLITUDE_RATIO <= one.displacement / line.amplitude <= LARGEST_GAIN
     ]
     return min(near, key=lambda one: abs(np.log(one.displacement / line.amplitude)), default=None)
 

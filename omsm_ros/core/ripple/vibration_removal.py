@@ -31,8 +31,8 @@ _LEAST_SIGMA = 4.0
 _OVER_FLOOR, _MODULATION_HZ, _WIDEST_HZ = 9.0, 1.0, 20.0
 # Greatest difference of two quartz clocks.
 _CLOCKS = 200e-6
-# Resolutions about a line that are near it.
-_NEAR = 4.0
+# Resolutions about a line that are near it; least height over the motion a/ω².
+_NEAR, _LEAST_GAIN = 4.0, 0.05
 REMOVED, NOT_IN_HEIGHTS, FORM = "removed", "not_in_heights", "like_form"
 
 
@@ -173,7 +173,7 @@ def _fitted(
     amplitude, sigma = float(np.hypot(*solution)) * size, scan.spectrum.sigma_at(seen)
     sure = float(significance(np.array(amplitude**2 / (2 * sigma**2)), tried))
     gain = amplitude / size
-    is_there = sure >= _LEAST_SIGMA and 1 / LARGEST_GAIN <= gain <= LARGEST_GAIN
+    is_there = sure >= _LEAST_SIGMA and _LEAST_GAIN <= gain <= LARGEST_GAIN
     # A match that is best beyond the search is the side lobe of another line.
     is_there &= clock is not None or abs(shift) <= _CLOCKS * frequency + scan.resolution(TIME) / 2
     left = heights - removed if is_there else heights

@@ -425,9 +425,9 @@ def dcc_quantities(calibration: Calibration) -> list[Quantity]:
     band, response = response_band(dynamics, calibration.covariance, at), dynamics.response(at)
     for k, frequency in enumerate(at.tolist()):
         gain, phase = float(abs(response[k])), float(np.angle(response[k]))
-        wide, turned = 2 * float(band.gain[k]), 2 * float(band.phase[k])
+        expanded, turned = 2 * float(band.gain[k]), 2 * float(band.phase[k])
         place = f"at {frequency:.6g} Hz"
-        found.append(Quantity("omsm_response", f"gain {place}", gain, r"\one", gain * wide))
+        found.append(Quantity("omsm_response", f"gain {place}", gain, r"\one", gain * expanded))
         found.append(Quantity("omsm_response", f"phase {place}", phase, r"\radian", turned))
     return found
 

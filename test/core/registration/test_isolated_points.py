@@ -146,7 +146,7 @@ def sparse(heights):
     return register(Flat(), lambda: [batch], ("piston", "tip", "tilt"))
 
 
-def test_a_pit_as_wide_as_the_tracks_are_apart_stays_where_there_is_no_dust():
+def test_a_pit_of_the_size_of_the_track_distance_stays_where_there_is_no_dust():
     """It shows on three tracks, with a third of its depth on two of them."""
     found = sparse(
         lambda x, y: -150e-9 * np.exp(-((x - x[4000]) ** 2 + (y - y[4000]) ** 2) / 0.12e-3**2)

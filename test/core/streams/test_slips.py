@@ -312,7 +312,7 @@ def test_a_link_known_to_be_late_is_tolerated() -> None:
 
 
 @pytest.mark.parametrize("delay_ns", [300_000, 600_000])
-def test_a_slip_that_a_delay_of_the_link_hides_is_found_by_the_change(delay_ns: int) -> None:
+def test_a_slip_that_cancels_the_delay_of_the_link_is_found_by_the_change(delay_ns: int) -> None:
     """After a slip by a sample the stamps agree to 0.7 ms or 0.4 ms, which alone is none."""
     late = [(_stamped(b, b.stamp_ns + delay_ns), n) for b, n in Device(ALL, jitter=1e-5).blocks()]
     done = join(late, Device(ALL, 80, jitter=1e-5, seed=1).blocks())

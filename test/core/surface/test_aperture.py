@@ -115,7 +115,7 @@ def test_an_aperture_of_the_nominal_surface_counts(text):
     assert around.outline in (made.outline, "disc")
 
 
-def test_a_disc_beside_the_origin_ends_at_its_points():
+def test_a_disc_off_the_origin_ends_at_its_points():
     """A flat turned up at its rim, scanned three tracks off the axis."""
     r, c = np.linspace(0, 5e-3, 4000), np.linspace(0, 100 * np.pi, 4000)
     height = 200e-9 * np.clip(r / 5e-3 - 0.8, 0, None) ** 2 / 0.04
@@ -123,9 +123,9 @@ def test_a_disc_beside_the_origin_ends_at_its_points():
     for shift in (0.0, 0.3e-3):
         batch = PointBatch(r * np.cos(c) + shift, r * np.sin(c), height, np.empty((0, len(r))))
         found.append(analyse_form(Flat(), lambda batch=batch: [batch], ("piston", "tip", "tilt")))
-    at_axis, beside = found
+    at_axis, shifted = found
     # The end of the outermost turn lies a track within the rim.
-    assert (beside.aperture.x, beside.aperture.radius) == pytest.approx((0.3e-3, 5e-3), abs=5e-5)
+    assert (shifted.aperture.x, shifted.aperture.radius) == pytest.approx((0.3e-3, 5e-3), abs=5e-5)
     for name in ("rms", "peak_to_valley"):
-        one, other = at_axis.deviation[name], beside.deviation[name]
+        one, other = at_axis.deviation[name], shifted.deviation[name]
         assert abs(one.value - other.value) <= 2 * np.hypot(one.uncertainty, other.uncertainty)
