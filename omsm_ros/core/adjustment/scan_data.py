@@ -235,13 +235,13 @@ def delayed(scan: ScanData, latency: float) -> ScanData:
 def _rate(time: FloatArray, values: FloatArray, order: int = 1) -> FloatArray:
     """Return the derivative of ``order`` by time, run by run between gaps."""
     period = float(np.median(np.diff(time)))
-    edges = np.flatnonzero(np.diff(time) > 1.5 * period) + 1
     made = np.empty(len(values))
-    for run in np.split(np.arange(len(time)), edges):
+    for run in np.split(np.arange(len(time)), np.flatnonzero(np.diff(time) > 1.5 * period) + 1):
         half = min(max(round(_HALF_WINDOW_S / period), 3), (len(run) - 1) // 2)
         if 2 * half + 1 > _POLYNOMIAL:
+            # The rounded weights add up to nearly zero: a large constant would leave a derivative.
             made[run] = scipy.signal.savgol_filter(
-                values[run], 2 * half + 1, _POLYNOMIAL, deriv=order, delta=period
+                values[run] - values[run[0]], 2 * half + 1, _POLYNOMIAL, order, period
             )
         else:
             ends = run[[0, -1]]
