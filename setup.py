@@ -42,7 +42,7 @@ setup(
             "SurfaceTopography>=1.20",
         ],
         "viewer": ["websockets>=14"],
-        "devices": ["pyads", "nidaqmx"],
+        "devices": ["pyads", "pandablocks", "nidaqmx"],
         "campaign": ["distributed"],
         "completion": ["shtab"],
         "pandas": ["pandas", "xarray"],

@@ -35,6 +35,7 @@ OPTIONAL = {
     "nptdms": "formats",
     "distributed": "campaign",
     "pyads": "devices",
+    "pandablocks": "devices",
     "shtab": "completion",
     "websockets": "viewer",
     "nidaqmx": "devices",

@@ -34,7 +34,7 @@ DEFAULT_BAUD_RATE = 921_600
 # A backlog is read in pieces: two seconds of it decoded at once left half a megabyte of unused
 # holes in the memory of the process.
 _CHUNK_BYTES = 16_384
-ADS_SCHEME = "ads://"
+ADS_SCHEME, PANDA_SCHEME = "ads://", "panda://"
 _TCP_SCHEME = "tcp://"
 # Keep-alive: the first probe after 5 s, then each 2 s; the connection is lost after 3 without
 # answer, or if sent data is not acknowledged within 10 s.
@@ -297,6 +297,7 @@ def transport_for(address: str, baud_rate: int = DEFAULT_BAUD_RATE) -> Transport
     """Return the transport that ``address`` names.
 
     ``tcp://host:port``; ``ads://host?symbol=GVL.omsm`` of a TwinCAT PLC;
+    ``panda://host?x=INENC1.VAL`` of a PandABox;
     ``serial:///dev/ttyUSB0?baud=921600`` or the path of a serial port
     (``baud_rate`` where the address has none); any URL that pyserial knows
     (``rfc2217://host:port``). Raises ConfigurationError.
@@ -307,9 +308,13 @@ def transport_for(address: str, baud_rate: int = DEFAULT_BAUD_RATE) -> Transport
             raise ConfigurationError(f"address {address!r}, expected tcp://host:port")
         return TcpTransport(host.strip("[]"), int(port))
     if address.startswith(ADS_SCHEME):
-        from omsm_ros.instruments.six_channel.device import AdsRing
+        from omsm_ros.instruments.six_channel.latches import AdsRing
 
         return AdsRing(address)
+    if address.startswith(PANDA_SCHEME):
+        from omsm_ros.instruments.six_channel.latches import PandaBox
+
+        return PandaBox(address)
     if address.startswith(_SERIAL_SCHEME):
         path, _, query = address[len(_SERIAL_SCHEME) :].partition("?")
         name, _, value = query.partition("=")

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from omsm_ros.errors import ConfigurationError, DeviceError
-from omsm_ros.instruments.six_channel.device import AdsRing, GenericStreamDevice
+from omsm_ros.instruments.six_channel.device import GenericStreamDevice
+from omsm_ros.instruments.six_channel.latches import AdsRing
 from omsm_ros.instruments.transport import transport_for
 
 pytest.importorskip("pyads", reason="pyads is an optional package")

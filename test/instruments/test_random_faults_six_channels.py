@@ -14,8 +14,9 @@ from loopback import Loopback
 
 from omsm_ros.instruments.emulator import Instrument, Measured
 from omsm_ros.instruments.scaling import AXES
-from omsm_ros.instruments.six_channel.device import AdsRing, GenericStreamDevice, StreamSettings
+from omsm_ros.instruments.six_channel.device import GenericStreamDevice, StreamSettings
 from omsm_ros.instruments.six_channel.emulator import SixChannelEmulator
+from omsm_ros.instruments.six_channel.latches import AdsRing
 from omsm_ros.instruments.six_channel.protocol import FRAME, FrameArray, StreamScaling
 
 from .conftest import Bench
@@ -133,9 +134,9 @@ def ring_bench(monkeypatch: pytest.MonkeyPatch) -> Any:
             set_timeout=lambda _: None,
         )
         router = SimpleNamespace(create_connection=lambda *_: SimpleNamespace(close=lambda: None))
-        monkeypatch.setattr("omsm_ros.instruments.six_channel.device.socket", router)
+        monkeypatch.setattr("omsm_ros.instruments.six_channel.latches.socket", router)
         fake = SimpleNamespace(Connection=lambda *_: connected, ADSError=OSError)
-        monkeypatch.setattr("omsm_ros.instruments.six_channel.device._pyads", lambda: fake)
+        monkeypatch.setattr("omsm_ros.instruments.six_channel.latches._pyads", lambda: fake)
         driver = device(SimulatedRing(loop), settings, loop.clock.nanoseconds, loop.clock)
         return Bench(loop, faulty(emulator)(ring, clock=loop.clock), driver)
 
