@@ -35,7 +35,7 @@ from omsm_ros.core.correction.machine_sources import (
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.systematic import EVALUATED
 from omsm_ros.core.form.deviation_map import Doubt, UncertainValue, conformity
-from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.kinematics.kinematics import Surface, workpiece_xy
 from omsm_ros.core.streams.blocks import Account
 from omsm_ros.core.surface.deviation import mismatch
 from omsm_ros.errors import BagError, ConfigurationError
@@ -60,7 +60,7 @@ _PAUSE_S = 20.0
 class AdjustedScan:
     """One scan as it was read for the adjustment.
 
-    bag: where it is from;  data: for the adjustment;  points: as corrected
+    bag: where it is from;  data: for the adjustment;  points: as corrected, in the part frame
     account: of every sample;  began_ns: ROS time of its first sample, None if it is not known
     doubts: mismatches with the calibration, which was used all the same, and with the nominal
         surface
@@ -85,7 +85,9 @@ def read_scan(
 ) -> AdjustedScan:
     """Correct a bag, and return its points with the motion of the axes, time from zero.
 
-    clocking: angle by which the part is turned on the chuck [rad];  clamping: its number
+    clocking: angle by which the part is turned on the chuck, from x towards y [rad]
+    clamping: its number
+
     Raises BagError for a bag without a surface point.
     """
     with Recording(bag) as recording:
@@ -93,10 +95,11 @@ def read_scan(
         axes, parts = scan.read()
     scan.check_points()
     data, made = scan_data(axes, parts, scan.sample_period, clocking, clamping)
+    x, y = workpiece_xy(made.x, made.y, np.full(len(made), clocking))
     return AdjustedScan(
         bag=str(bag),
         data=data,
-        points=made,
+        points=replace(made, x=x, y=y),
         account=scan.account,
         began_ns=scan.recorded_ns,
         doubts=tuple(map(str, scan.reasons)),

@@ -1,0 +1,55 @@
+"""A part turned on the chuck has one x and y in all scans, and is no other surface."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.correction.correct import CorrectionOptions
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.io.results import CloudFile
+from omsm_ros.pipelines.adjust import adjust_bags, write_adjustment
+
+from .test_corrected_scan import write
+
+TURNED_RAD = 1.2
+
+
+def on_chuck(blocks, angle):
+    """Return ``blocks`` of the same part turned by ``angle`` from x towards y, C with it."""
+    return [(replace(axes, c=axes.c - angle), distance) for axes, distance in blocks]
+
+
+@pytest.fixture(scope="module")
+def adjusted(tmp_path_factory, small_scan_blocks, true_calibration):
+    folder = tmp_path_factory.mktemp("turned")
+    bags = []
+    for k, angle in enumerate((0.0, TURNED_RAD)):
+        # The same scan twice would verify itself: another nanometre of distance.
+        blocks = [
+            (axes, replace(distance, distance=distance.distance + 1e-9 * k))
+            for axes, distance in small_scan_blocks
+        ]
+        bags.append(write(folder / f"{k}.mcap", on_chuck(blocks, angle)))
+    found, scans = adjust_bags(
+        bags, true_calibration, nominal=PAPER_MIRROR, options=CorrectionOptions(),
+        clockings=(0.0, TURNED_RAD),
+    )  # fmt: skip
+    write_adjustment(folder, {}, found, scans, report=False)
+    return scans, CloudFile(folder / "adjusted.ply").read()
+
+
+def test_a_turned_part_is_of_the_nominal_surface(adjusted):
+    scans, _ = adjusted
+    assert [scan.doubts for scan in scans] == [scans[0].doubts] * 2
+    assert not any("another surface" in doubt for doubt in scans[0].doubts)
+
+
+def test_the_cloud_has_each_place_of_the_part_once(adjusted):
+    scans, cloud = adjusted
+    first = len(scans[0].points)
+    for name in "xy":
+        one, other = cloud[name][:first], cloud[name][first:]
+        assert np.max(abs(one - other)) < 1e-8
