@@ -112,7 +112,7 @@ class Panda:
         self.plug()
 
     def forget(self) -> None:
-        """Lose the capture without a word, as by a restart behind a switch."""
+        """Lose the capture silently, as by a restart behind a switch."""
         with self.lock:
             self.experiment += 1
             self.busy, self.rows, self.lost, self.captured = False, [], 0, 0

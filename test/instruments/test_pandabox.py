@@ -98,7 +98,7 @@ def test_scale_and_offset_of_the_web_page_change_no_position(panda):
     assert axes_of(blocks, "z") == pytest.approx((1000 - 20 * np.arange(1, 41)) * 1e-8, rel=1e-12)
 
 
-def test_a_scale_that_hides_the_counts_is_reported(panda, device):
+def test_a_scale_with_too_many_digits_is_reported(panda, device):
     panda.scales["INENC2.VAL"] = (1e-12, 1 / 3, "m")
     panda.trigger(5)
     with pytest.raises(DeviceError, match=r"INENC2\.VAL with SCALE 1e-12 and OFFSET 0\.33"):
@@ -188,7 +188,7 @@ def test_a_capture_that_ends_is_one_error_with_its_remedy(panda, device, reason,
     assert device.statistics.restarts == 1
 
 
-def test_a_reader_that_is_too_slow_is_told_so(panda, device):
+def test_a_reader_that_is_too_slow_is_reported(panda, device):
     panda.room = 10
     panda.trigger(5)
     poll_until(device, 5)

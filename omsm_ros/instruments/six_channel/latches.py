@@ -168,7 +168,7 @@ _MOST_HEADER, _MOST_FRAME = 2**15, 2**17
 # After such a silence the box is asked whether its capture goes on, and how often [s].
 _SILENT_S, _ASK_S = 1.0, 0.5
 _DIGITS = 19  # of a number that a box states
-# What is left of a count when the scale, of which the server states 12 digits, is taken out.
+# The server states 12 digits of a scale, so counts computed with it are nearly whole: up to this.
 _NO_COUNT = 0.1
 _FIELD = re.compile(r"[A-Z]+[0-9]*\.[A-Z][A-Z0-9_]*")
 _ENDS = {
