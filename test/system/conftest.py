@@ -194,10 +194,18 @@ def operator_of(processes):
 
     class Operator(DemoNode):
         def __init__(self):
-            self.reports = Counter()
+            self.reports, self._forgotten_ns = Counter(), 0
             super().__init__(processes)
 
+        def forget(self, node):
+            """Forget what a node that has ended said, and what of it is still on the way."""
+            self._status.pop(node, None)
+            self._forgotten_ns = time.time_ns()
+
         def _on_diagnostics(self, message):
+            stamp = message.header.stamp
+            if stamp.sec * 10**9 + stamp.nanosec < self._forgotten_ns:
+                return
             super()._on_diagnostics(message)
             self.reports.update(status.name.removeprefix("/omsm/") for status in message.status)
 

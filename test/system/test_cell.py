@@ -123,7 +123,7 @@ def test_killed_and_restarted_emulator(cell, true_calibration):
     before = cell.settle("corrector", "axes_received")
     assert before < 20_000
     # It plays no longer, whatever it said last.
-    cell.operator._status.pop("cell_emulator", None)
+    cell.operator.forget("cell_emulator")
 
     cell.start_emulator()
     reconnected(cell)

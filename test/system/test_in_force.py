@@ -57,7 +57,7 @@ def until(cell, node, calibration):
 def again(cell, node, start):
     """Kill a node, start it anew, and wait until the new one has spoken."""
     cell.processes.end(node, how=signal.SIGKILL)
-    cell.operator._status.pop(node, None)
+    cell.operator.forget(node)
     start()
 
 

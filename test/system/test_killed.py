@@ -39,7 +39,7 @@ def kill_at(cell, node, samples, restart):
         lambda: cell.operator.value("cell_emulator", "samples_played") >= samples,
     )
     cell.processes.end(node, how=signal.SIGKILL)
-    cell.operator._status.pop(node, None)
+    cell.operator.forget(node)
     restart()
     cell.wait(f"the new {node}", lambda: cell.operator.text(node, "lifecycle") == "active")
 

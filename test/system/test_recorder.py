@@ -33,6 +33,13 @@ def end(cell, *signals):
     cell.processes.end("recorder", how=signals[-1])
 
 
+def forget(cell, publisher):
+    """Wait until the recorder that has ended is gone, so that it does not pass for the next."""
+    cell.wait("its end is known", lambda: publisher.get_subscription_count() == 0)
+    cell.operator.destroy_publisher(publisher)
+    cell.operator.forget("recorder")
+
+
 class Source:
     """Publishes blocks of axes, each with the number that follows."""
 
@@ -69,8 +76,7 @@ def end_again_and_again(cell, times, signals):
         source.publish(int(random.integers(1, 400)), pause=0.001)
         end(cell, *signals)
         assert numbers_in(path) == list(range(source.published))
-        cell.operator.destroy_publisher(publisher)
-        cell.operator._status.clear()
+        forget(cell, publisher)
 
 
 def test_ctrl_c_below_launch_five_times(cell):

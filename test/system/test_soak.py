@@ -153,7 +153,7 @@ class Hour:
 
     def killed(self, node):
         self.cell.processes.end(node, how=signal.SIGKILL)
-        self.cell.operator._status.pop(node, None)
+        self.cell.operator.forget(node)
         self.restart[node]()
         begin = time.monotonic()
         self.cell.wait(f"the new {node}", lambda: self._state(node) == "active")
