@@ -66,7 +66,7 @@ class Source:
     def row(self) -> dict[str, object]:
         """Return the row of a file of sources."""
         said = {"source": self.name, "value": self.value, "unit": self.unit, **self.more}
-        return {**said, "how": "evaluated", "reason": "as drawn for this machine"}
+        return {**said, "how": "evaluated", "reason": "drawn for this machine, 2026-03-02"}
 
 
 def _harmonic(kind: Callable, per_turn: float) -> Build:

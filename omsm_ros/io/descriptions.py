@@ -166,14 +166,14 @@ def load_multisine(path: Path | str) -> MultisinePlan:
 # sources:
 #   - {source: tilt, value: 5.0e-6, unit: rad, how: declared, reason: dial gauge at the rim}
 #   - {source: spindle_axial, per_turn: 2, value: 8.0e-9, unit: m, distribution: arcsine,
-#      how: evaluated, reason: ball and capacitive sensor}
+#      how: evaluated, reason: ball and capacitive sensor, date: 2026-11-29}
 
 SCHEMA = "omsm-sources/1"
 _MOST_SOURCES = 200
 _TEXT = {"type": "string"}
 _OWN = {"source": _TEXT, "value": NUMBER, "unit": _TEXT, "how": _TEXT, "reason": _TEXT}
 _PARAMETERS = {key: NUMBER for kind in KINDS.values() for key in kind.parameters}
-# How a source was evaluated; for people, and for the next evaluation of the same source.
+# How a source was evaluated; a size that it found is for people.
 _EVALUATION = {"found": NUMBER, "uncertainty": NUMBER, "recording": _TEXT, "date": _TEXT,
                "command": _TEXT}  # fmt: skip
 _ITEM = form({**_OWN, "distribution": _TEXT, **_PARAMETERS, **_EVALUATION}, tuple(_OWN))
@@ -221,7 +221,11 @@ def _stated(item: Mapping[str, Any]) -> StatedSource:
     own = {name: item[name] for name in (*_OWN, "distribution") if name in item}
     unit = own.pop("unit")
     own["source"] = FORMER_NAMES.get(own["source"], own["source"])
-    stated = StatedSource(**own, parameters={k: v for k, v in item.items() if k in _PARAMETERS})
+    stated = StatedSource(
+        **own,
+        parameters={k: v for k, v in item.items() if k in _PARAMETERS},
+        evaluation=" ".join(item[k] for k in ("recording", "date", "command") if k in item),
+    )
     expected = KINDS[stated.source].quantity.unit or "1" if stated.source in KINDS else "m"
     if unit != expected:
         raise ConfigurationError(f"{stated.source} is stated in {unit!r}, expected {expected!r}")

@@ -174,7 +174,7 @@ def _prior(source: StatedSource, abbe_arm: float) -> Source:
             )
         size *= arm
     parameters = source.parameters
-    return Source(name, size, parameters.get("correlation_length"), source.how == EVALUATED,
+    return Source(name, size, parameters.get("correlation_length"), source.origin == EVALUATED,
                   parameters.get("period"), parameters.get("half_range"))  # fmt: skip
 
 
@@ -206,16 +206,10 @@ def adjust_bags(
                 f"{len(given)} values of {name} for {len(bags)} scans; give one for each scan"
             )
     options = options or CorrectionOptions()
+    places = zip(clockings or [0.0] * len(bags), clampings or [0] * len(bags), strict=True)
     scans = [
-        read_scan(
-            bag,
-            calibration,
-            options,
-            clocking=clockings[k] if clockings else 0.0,
-            clamping=clampings[k] if clampings else 0,
-            admission=admission,
-        )
-        for k, bag in enumerate(bags)
+        read_scan(bag, calibration, options, clocking=turn, clamping=again, admission=admission)
+        for bag, (turn, again) in zip(bags, places, strict=True)
     ]
     scans = on_one_clock(_checked(scans, nominal))
     return adjust(

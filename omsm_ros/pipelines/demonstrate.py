@@ -46,7 +46,7 @@ from omsm_ros.pipelines.form import RegistrationOptions
 from omsm_ros.pipelines.measure import Judgement, with_sources
 from omsm_ros.pipelines.publish import publish_scan
 from omsm_ros.pipelines.record_bags import NOMINAL, write_nominal
-from omsm_ros.readable import quantity
+from omsm_ros.readable import now_text, quantity
 from omsm_ros.report.verdict import headline
 from omsm_ros.twin.cell import Probe, Recording, compare_with_truth
 from omsm_ros.twin.disturbances import Disturbances, TrueResponse
@@ -73,6 +73,8 @@ _EVALUATED = {
     "pitch": 1e-6,
     "straightness_x": 2e-9,
     "straightness_z": 2e-9,
+    "positioning_x": 2e-9,
+    "expansion": 1e-7,
     "probe_slope_square": 1e-8,
     "drift_walk": 0.2e-9,
 }
@@ -279,13 +281,16 @@ def _adjusted(plan: Demonstration, calibration: Calibration) -> dict[str, Any]:
 
 def twin_sources() -> MachineSources:
     """Return the sources that two scans do not show; the twin is built without them."""
-    why = {"how": EVALUATED, "reason": "the twin is built without this error"}
+    why = {
+        "how": EVALUATED,
+        "reason": "the twin is built without this error",
+        "evaluation": f"omsm demo, {now_text()}",
+    }
+    once = StatedSource(source="c_error", value=1e-6, **why, parameters={"per_turn": 1})
     known = _EVALUATED.items()
-    return MachineSources(
-        tuple(
-            StatedSource(source=n, value=v, **why, parameters=_LENGTHS.get(n, {})) for n, v in known
-        )
-    )
+    return MachineSources((once, *(
+        StatedSource(source=n, value=v, **why, parameters=_LENGTHS.get(n, {})) for n, v in known
+    )))  # fmt: skip
 
 
 def form_truth(part: FigureError, found: Adjustment) -> dict[str, float]:

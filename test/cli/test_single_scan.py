@@ -122,7 +122,8 @@ def test_a_step_test_is_no_scan(capsys, shop):
 
 def test_pitch_without_an_arm_evaluates_nothing(capsys, shop):
     pitch = (
-        "  - {source: pitch, value: 1.0e-6, unit: rad, how: evaluated, reason: autocollimator}\n"
+        "  - {source: pitch, value: 1.0e-6, unit: rad, how: evaluated, reason: autocollimator, "
+        "date: 2026-03-02}\n"
     )
     (shop / "pitch.yaml").write_text(STATED + pitch, encoding="utf-8")
     words = ["correct", "scan.mcap", "--calibration", "cal.json", "--sources", "pitch.yaml",

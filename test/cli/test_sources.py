@@ -113,14 +113,15 @@ def test_the_twin_makes_recordings_of_which_the_command_writes_the_sources(
         assert item["recording"].endswith(".mcap")
         assert "UTC" in item["date"]
         assert item["command"].startswith("omsm sources ")
-    assert {s.source: s.how for s in load_sources(out).stated}["centre_y"] == "evaluated"
+    assert {s.source: s.origin for s in load_sources(out).stated}["centre_y"] == "evaluated"
 
 
 def test_a_stated_linearity_counts_for_the_square_of_the_distance_too(tmp_path):
     """A file of sources knows one linearity error; the adjustment has two shapes of it."""
     (tmp_path / "sources.yaml").write_text(
         "schema: omsm-sources/1\nsources:\n  - {source: probe_linearity, value: 3.0e-9, unit: m, "
-        "half_range: 5.0e-5, how: evaluated, reason: five stand-offs}\n", encoding="utf-8",
+        "half_range: 5.0e-5, how: evaluated, reason: five stand-offs of 2026-03-02}\n",
+        encoding="utf-8",
     )  # fmt: skip
     priors = priors_of(load_sources(tmp_path / "sources.yaml"))
     assert {(p.name, p.uncertainty, p.evaluated, p.half_range) for p in priors} == {
@@ -130,9 +131,34 @@ def test_a_stated_linearity_counts_for_the_square_of_the_distance_too(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("entry", "counts"),
+    [
+        ("reason: sphere.mcap of 2026-03-02", True),
+        ("reason: test report, date: 2026-03-02", True),
+        ("reason: r, recording: still.mcap, date: 2026-03-02 10:00 UTC", True),
+        ("reason: test report of X", False),
+        ("reason: sphere.mcap of 2026-13-40", False),
+        ("reason: '2026-03-02'", False),
+        *((f"reason: {text}, date: 2026-03-02", False)
+          for text in ("none", "n/a", "'-'", "assumed", "a guess", "unknown")),
+    ],
+)  # fmt: skip
+def test_an_evaluation_says_when_and_from_what(tmp_path, entry, counts):
+    path = tmp_path / "sources.yaml"
+    source = "{source: centre_x, value: 1.0e-6, unit: m, how: evaluated, "
+    listed = f"schema: omsm-sources/1\nsources:\n  - {source}{entry}}}\n"
+    path.write_text(listed, encoding="utf-8")
+    stated = load_sources(path)
+    assert stated.stated[0].origin == ("evaluated" if counts else "declared")
+    assert [p.evaluated for p in priors_of(stated)] == [counts]
+    assert [s.origin for s in stated.scan_sources()] == [stated.stated[0].origin]
+
+
+@pytest.mark.parametrize(
     ("family", "declared"),
     [("creep", None), ("probe_square", "probe_linearity"), ("spindle_axial/3", "spindle_axial"),
-     ("centre_x", "centre_x"), ("lag_x", None)],
+     ("centre_x", "centre_x"), ("lag_x", None), ("c_error/2", "c_error"),
+     ("positioning_x", "positioning_x")],
 )  # fmt: skip
 def test_only_what_a_file_of_sources_accepts_is_to_be_declared(family, declared):
     reason = Reason("not_evaluated", (family, "other_speed"), 3e-8, 2e-8)

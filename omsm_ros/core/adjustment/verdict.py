@@ -174,7 +174,7 @@ def not_evaluated(
     found = []
     for family in families:
         prior = stated.get(base_name(family.name))
-        if not family.named or family.default is not None or (prior and prior.evaluated):
+        if not family.named or (prior and prior.evaluated):
             continue
         free = effects.get(family.name, NO_EFFECT).free
         if free > limit:

@@ -8,6 +8,7 @@ the adjustment assumes, or *not evaluated*; then its contribution is unknown, no
 """
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -49,6 +50,17 @@ SYSTEMATIC = tuple(KINDS)
 NAMES = (*_STATED_RANDOM, *SYSTEMATIC)
 
 
+_DATE = re.compile(r"(?<!\d)\d{4}-(?:0[1-9]|1[0-2])-(?:0[1-9]|[12]\d|3[01])(?!\d)")
+# Words that name no measurement.
+_NO_MEASUREMENT = {"none", "nothing", "unknown", "assumed", "assumption", "guess", "guessed"}
+
+
+def _is_evaluation(text: str) -> bool:
+    """Return whether ``text`` has a date (2026-11-29), and says what was done."""
+    words = set(re.findall(r"[^\W\d_]{3,}", _DATE.sub(" ", text).lower()))
+    return bool(_DATE.search(text) and words - _NO_MEASUREMENT)
+
+
 @dataclass(frozen=True, kw_only=True)
 class StatedSource:
     """Statement about one source.
@@ -57,7 +69,7 @@ class StatedSource:
     value: standard uncertainty; half-width of a uniform distribution, amplitude of an arcsine
         distribution (a wave of unknown phase)
     how: EVALUATED from data, DECLARED or ASSUMED;  reason: where the value comes from
-    parameters: of its kind
+    parameters: of its kind;  evaluation: recording, date and command, where they are stated apart
     """
 
     source: str
@@ -66,6 +78,7 @@ class StatedSource:
     reason: str
     distribution: str = "normal"
     parameters: Mapping[str, float] = field(default_factory=dict)
+    evaluation: str = ""
 
     def __post_init__(self) -> None:
         allowed = [name for name in NAMES if name not in OF_CALIBRATION]
@@ -98,6 +111,12 @@ class StatedSource:
             self.systematic()
 
     @property
+    def origin(self) -> str:
+        """``how``, but DECLARED for an evaluation that does not say when it was made, and how."""
+        unsaid = self.how == EVALUATED and not _is_evaluation(f"{self.reason} {self.evaluation}")
+        return DECLARED if unsaid else self.how
+
+    @property
     def standard_uncertainty(self) -> float:
         """Standard uncertainty in the unit of the source, k = 1."""
         return self.value * DISTRIBUTIONS[self.distribution]
@@ -105,7 +124,7 @@ class StatedSource:
     def systematic(self) -> SystematicSource:
         """Return the source with its sensitivity fields."""
         return SystematicSource(
-            self.source, self.standard_uncertainty, self.how, self.reason, self.parameters
+            self.source, self.standard_uncertainty, self.origin, self.reason, self.parameters
         )
 
 
@@ -213,7 +232,7 @@ def origin_of(
 ) -> tuple[str, str | Notice]:
     """Return EVALUATED or DECLARED for a source of single points, and the reason."""
     if said := stated.of(name):
-        return said[0].how, said[0].reason
+        return said[0].origin, said[0].reason
     if name == "probe_latency":
         latency = calibration.latency
         if not latency.resolved:

@@ -261,6 +261,16 @@ KINDS: dict[str, SourceKind] = {
         needs_slope=True,
         squares=lambda p, _: _across(p, 1.0, 0.0) ** 2,
     ),
+    # An unknown curve over X, along X and across it.
+    "positioning_x": SourceKind(
+        _METRES,
+        lambda p, own: np.concatenate(
+            [_across_both(p, off) for off in _curve_components(p.slide_x, own)]
+        ),
+        _CORRELATED,
+        _LENGTH_OPTIONAL,
+        needs_slope=True,
+    ),
     "pitch": SourceKind(
         _RADIANS,
         lambda p, own: own["arm"] * _curve_components(p.z, own),
@@ -274,6 +284,13 @@ KINDS: dict[str, SourceKind] = {
     ),
     "spindle_radial": SourceKind(_METRES, _rotating_shift, _PER_TURN, needs_slope=True),
     "spindle_tilt": SourceKind(_RADIANS, _rotating_tilt, _PER_TURN),
+    # The angle of C, which turns the reported points about the spindle.
+    "c_error": SourceKind(
+        _RADIANS,
+        lambda p, own: p.height_change_of_shift(-p.y, p.x) * _phases(own["per_turn"] * p.c),
+        _PER_TURN,
+        needs_slope=True,
+    ),
     "encoder_scale": SourceKind(_SHARE, lambda p, _: p.z),
     "encoder_interpolation": SourceKind(_METRES, lambda p, own: _periodic(p.z, own), _PERIOD),
     # The cube of the distance, one at the end of the range.

@@ -36,7 +36,9 @@ def table():
         machine.scan(30, clocking=np.deg2rad(80)),
     ]
     exact = (Source("part_shift", 1e-9), Source("part_turn", 1e-8))
-    priors = [p for p in PRIORS if p.name not in ("part_shift", "part_turn")] + [*exact]
+    priors = [p for p in PRIORS if p.name not in ("part_shift", "part_turn")]
+    # Two scans to the centre leave it open.
+    priors += [*exact, Source("expansion", 2e-7, evaluated=True)]
     found = [adjust(scans[:n], priors, nominal=MIRROR, accuracy=25e-9) for n in (1, 2, 3)]
     return machine, scans, found
 
@@ -79,6 +81,15 @@ def test_one_scan_is_too_uncertain_and_names_the_scan_to_add(table):
     assert two.verdict.code == three.verdict.code == VERIFIED
     assert not two.verdict.reasons
     assert all(a.largest < a.limit for a in three.agreement)
+
+
+def test_a_default_size_evaluates_nothing(table):
+    """A source that takes part by a default is as little known as one that nobody declared."""
+    _, scans, (_, two, _) = table
+    found = adjust(scans[:2], PRIORS, nominal=MIRROR, accuracy=25e-9)
+    assert two.verdict.code == VERIFIED
+    assert found.verdict.code == NOT_VERIFIED
+    assert [(r.names[0], r.code) for r in found.verdict.reasons] == [("expansion", "not_evaluated")]
 
 
 def test_a_reclocked_scan_shows_the_spindle(table):

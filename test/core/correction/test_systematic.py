@@ -24,6 +24,7 @@ PARAMETERS = {
     "spindle_axial": {"per_turn": 2},
     "spindle_radial": {"per_turn": 2},
     "spindle_tilt": {"per_turn": 1},
+    "c_error": {"per_turn": 1},
     "encoder_interpolation": {"period": 4e-6},
     "probe_linearity": {"half_range": 50e-6},
     "probe_periodic": {"period": 7e-6},
