@@ -183,9 +183,9 @@ class Counting:
 class SequenceTracker:
     """Cuts samples in the order of arrival into runs, and counts missing and repeated ones.
 
-    A repeated sample is a duplicate. A counter or time that falls back, or a counter at zero after
-    a silence, is a restart of the device; its own number counts from there. Any other number that
-    is not the next one is a gap.
+    A repeated sample or number is a duplicate. A counter or time that falls back, or a counter at
+    zero after a silence, is a restart of the device; its own number counts from there. Any other
+    number that is not the next one is a gap.
     """
 
     def __init__(self, counting: Counting) -> None:
@@ -289,10 +289,10 @@ class SequenceTracker:
         elif self._anew or self._counter_fell_back(raw, step, advance, pause):
             self.restarts += 1
             yield self._accept(alone, raw, True)
-        elif step == 0:
+        elif (step := step + self._turns(step, pause) * self._counting.modulus) == 0:
             self.duplicates += 1
+            self._time += advance
         else:
-            step += self._turns(step, pause) * self._counting.modulus
             self.lost += step - 1
             self.gaps += step > 1
             yield self._accept(alone, self._counter + step, False)
@@ -304,24 +304,24 @@ class SequenceTracker:
     def _counter_fell_back(self, raw: int, step: int, advance: int, pause: _StreamBreak) -> bool:
         if step == 1:
             return advance < 0
-        if pause.broken and raw == 0:
+        if advance < 0 or (pause.broken and raw == 0):
             return True
-        if step == 0 or advance < 0:
-            return advance != 0
         period = self._counting.period
+        whole = step + self._turns(step, pause) * self._counting.modulus
+        uneven = abs(pause.elapsed - whole * period) > _SLACK_S
+        if step == 0:  # without a silence, only a counter reset at this number repeats it
+            return advance > 0 and (uneven or (raw == 0 and self._counter > 0))
         if not period:
             return step >= self._counting.modulus // 2
         if self._counting.timed:
             return step * period > advance * NANOSECOND_S + 2 * period
-        if not pause.broken:
-            return (step - 1) * period > pause.elapsed + _SLACK_S
-        whole = step + self._turns(step, pause) * self._counting.modulus
-        return abs(pause.elapsed - whole * period) > _SLACK_S
+        return uneven if pause.broken else (step - 1) * period > pause.elapsed + _SLACK_S
 
     def _turns(self, step: int, pause: _StreamBreak) -> int:
         """Return the whole turns of the counter in a silence."""
-        elapsed = pause.elapsed / self._counting.period if self._counting.period else 0.0
-        return max(0, round((elapsed - step) / self._counting.modulus))
+        period, known = self._counting.period, self._counting.timed or pause.broken
+        turns = (pause.elapsed / period - step) / self._counting.modulus if period and known else 0
+        return max(0, round(turns))
 
 
 @dataclass(frozen=True, slots=True)

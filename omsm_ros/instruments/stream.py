@@ -94,8 +94,7 @@ class StreamDevice:
         self._now_ns = now_ns
         self._monotonic = monotonic
         self._tracker = SequenceTracker(counting)
-        small = not counting.timed and counting.modulus <= _SMALL_COUNTER
-        self._small_counter = counting.modulus if small else 0
+        self._small_counter = counting.modulus if counting.modulus <= _SMALL_COUNTER else 0
         self._cutter = BlockCutter(settings, channels)
         self._identity: dict[str, str] = {}
         self.decoded = 0
@@ -208,8 +207,8 @@ class StreamDevice:
             )
         if self._small_counter:
             return (
-                f"{self._transport.name}: a counter of {self._small_counter} without time shows no "
-                f"loss of {self._small_counter} samples or a multiple; let the device send its time"
+                f"{self._transport.name}: a counter of {self._small_counter} shows no loss of "
+                f"{self._small_counter} samples or a multiple; let the device count further"
             )
         if self._cutter.perhaps_at_zero:
             return (

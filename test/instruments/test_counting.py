@@ -151,6 +151,65 @@ def test_a_device_known_to_have_been_restarted_counts_from_its_number() -> None:
     assert (tracker.restarts, tracker.lost) == (1, 0)
 
 
+def still(count: int, number: int, taken: int = 0) -> Samples:
+    """Return samples of one number, 1 ms apart, from the time of sample ``taken`` on."""
+    made = samples([number] * count)
+    made["time"] = (taken + np.arange(count)) * 1_000_000
+    return made
+
+
+@pytest.mark.parametrize("number", [0, 512])
+@pytest.mark.parametrize("period", [0.0, 1e-3])
+@pytest.mark.parametrize(("modulus", "timed"), [(2**16, True), (4, True), (4, False)])
+def test_a_counter_that_stands_still_is_no_restart(
+    modulus: int, timed: bool, period: float, number: int
+) -> None:
+    tracker = SequenceTracker(Counting(modulus, timed=timed, checked=False, period=period))
+    stream = still(8000, number % modulus)
+    portions = [stream[i : i + 50] for i in range(0, 8000, 50)]
+    assert numbers(tracker, *portions, elapsed=0.05) == [number % modulus]
+    assert (tracker.duplicates, tracker.restarts, tracker.lost) == (7999, 0, 0)
+
+
+def test_a_counter_that_goes_on_after_it_stood_still_goes_on() -> None:
+    tracker = SequenceTracker(Counting(2**16, timed=True, checked=False, period=1e-3))
+    stood, after = still(500, 7), samples([8, 9])
+    after["time"] = np.array([500, 501]) * 1_000_000
+    assert numbers(tracker, stood, after) == [7, 8, 9]
+    assert (tracker.duplicates, tracker.restarts, tracker.lost) == (499, 0, 0)
+
+
+def test_a_counter_reset_at_zero_of_a_later_turn_is_a_restart() -> None:
+    """The other device of the cell was reset with it, so the turns must not stay."""
+    tracker = SequenceTracker(Counting(2**16, timed=True, checked=False))
+    count = samples(list(range(2**16 + 1)))
+    count["time"] = np.arange(len(count)) * 1_000_000
+    again = samples([0, 1, 2])
+    again["time"] = (len(count) + np.arange(3)) * 1_000_000
+    assert numbers(tracker, count, again) == [*range(2**16 + 1), 0, 1, 2]
+    assert (tracker.duplicates, tracker.restarts) == (0, 1)
+
+
+@pytest.mark.parametrize("period", [0.0, 1e-3])
+def test_all_samples_of_a_turn_are_lost_by_the_clock_of_a_free_running_device(
+    period: float,
+) -> None:
+    """A triggered device may have waited as long, and repeats its number."""
+    tracker = SequenceTracker(Counting(4, timed=True, period=period))
+    before, after = still(1, 2), still(1, 2, taken=4)
+    assert numbers(tracker, before, after) == ([2, 6] if period else [2])
+    assert (tracker.lost, tracker.duplicates) == ((3, 0) if period else (0, 1))
+
+
+@pytest.mark.parametrize("silence", [0.01, 0.1])
+def test_the_time_between_portions_adds_no_turns_of_a_small_counter(silence: float) -> None:
+    tracker = SequenceTracker(Counting(4, timed=False, period=1e-3))
+    numbers(tracker, samples([0, 1, 2]))
+    made = samples([0, 1], content=4)
+    assert numbers(tracker, made, elapsed=silence) == [4, 5]
+    assert tracker.lost == 1
+
+
 @given(st.lists(st.integers(1, 60), min_size=1, max_size=40), st.integers(0, 2**16 - 1), st.data())
 def test_any_portions_give_the_same_numbers(
     steps: list[int], start: int, data: st.DataObject

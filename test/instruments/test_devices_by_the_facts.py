@@ -468,7 +468,7 @@ def test_peaks_before_and_behind_the_range_are_told_from_no_peak() -> None:
 
 
 @pytest.mark.parametrize(("modulus", "warned"), [(4, True), (2**16, False)])
-def test_a_small_counter_without_time_is_warned_of(modulus: int, warned: bool) -> None:
+def test_a_small_counter_is_warned_of(modulus: int, warned: bool) -> None:
     """The loss of all samples of one turn of a counter shows in nothing that came."""
 
     numbers = np.delete(np.arange(7000), slice(3050, 3054))

@@ -12,6 +12,7 @@ from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
 from omsm_ros.instruments.chrocodile.packet_protocol import PacketCommand, encode_command
 from omsm_ros.instruments.micro_epsilon.device import ConfocalDtDevice, ConfocalDtSettings
 from omsm_ros.instruments.micro_epsilon.protocol import encode_frames
+from omsm_ros.instruments.six_channel.device import CsvSettings, CsvStreamDevice
 
 from .scripted_stream import Script
 
@@ -65,3 +66,30 @@ def test_a_counter_that_stands_still_is_reported() -> None:
     with pytest.raises(NoSamplesError, match=r"repeats its sample counter \(512\)"):
         read()
     assert now[0] < 2.5
+
+
+@pytest.mark.parametrize("columns", [("sequence", "device_time", "x"), ("sequence", "x")])
+def test_a_counter_that_stands_still_is_reported_although_time_goes_on(
+    columns: tuple[str, ...],
+) -> None:
+    now = [0.0]
+    row = "{} {} {}\n" if len(columns) == 3 else "{} {}\n"
+    lines = [row.format(7, *(k * 10**6, k)[4 - len(columns) - 1 :]) for k in range(4000)]
+    portions = ["".join(lines[i : i + 100]).encode() for i in range(0, 4000, 100)]
+    device = CsvStreamDevice(
+        Script(*portions),
+        CsvSettings(columns=columns),
+        lambda: round(now[0] * 1e9),
+        lambda: now[0],
+    )
+    device.open()
+
+    def read() -> None:
+        for _ in portions:
+            now[0] += 0.1
+            device.poll(0.0)
+
+    with pytest.raises(NoSamplesError, match=r"repeats its sample counter \(7\)"):
+        read()
+    found = device.statistics
+    assert (found.restarts, found.duplicates + found.held) == (0, found.decoded - 1)
