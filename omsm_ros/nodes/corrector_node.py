@@ -246,7 +246,8 @@ class CorrectorNode(ManagedNode):
 
     def _take_rest(self, heard: Sequence[Any]) -> None:
         """Correct what the drivers, which end at the same time, have sent last."""
-        take_rest(heard, _LAST_LOOKS)
+        if not take_rest(heard, _LAST_LOOKS):
+            self.get_logger().warning("the last samples were not corrected: too many waited")
         for stream in _STREAMS:
             self._push(stream)
 

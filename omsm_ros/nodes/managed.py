@@ -25,6 +25,7 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.duration import Duration
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -157,12 +158,21 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     return descriptor
 
 
+def _acknowledged(publisher: Publisher) -> bool:
+    """Return whether all messages have arrived; waits for it 10 ms, with other threads stopped."""
+    try:
+        return bool(publisher.wait_for_all_acked(_STEP))
+    except rclpy_implementation.RCLError:  # a middleware that cannot tell
+        time.sleep(_STEP.nanoseconds / 1e9)
+        return not publisher.get_subscription_count()
+
+
 NAMESPACE = "omsm"
 ARGUMENTS: dict[str, list[str]] = {}
 """Further arguments for ROS of one of several nodes of a process, by its name."""
-# A destroyed publisher drops the messages that subscribers have not fetched yet, so wait before. In
-# short steps, since a busy computer may skip the time of a long one.
-_STEPS, _STEP_S = 20, 0.01
+# A destroyed publisher drops what its subscribers have not acknowledged, so it waits before that.
+# In short steps, since rclpy stops other threads meanwhile. A subscriber that stands still has 1 s.
+_STEPS, _STEP = 100, Duration(nanoseconds=10_000_000)
 AUTOSTART = Parameter("autostart", True, "configure and activate at the start", fixed=True)
 
 
@@ -317,9 +327,10 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             log_internal_error(self, err)
 
     def _wait_for_last_messages(self) -> None:
-        if any(publisher.get_subscription_count() for publisher in self._outputs):
-            for _ in range(_STEPS):
-                time.sleep(_STEP_S)
+        for _ in range(_STEPS):
+            if all(map(_acknowledged, self._outputs)):
+                return
+        self.get_logger().warning("a subscriber has not received the last messages within 1 s")
 
     def _answer_impossible_transitions(self) -> None:
         """Let a request for an impossible transition be answered, where rcl raises an exception."""

@@ -105,7 +105,8 @@ class RecorderNode(ManagedNode):
             self.get_logger().error(f"{type(err).__name__}: {err}")
 
     def _take_rest(self) -> None:
-        take_rest([(s, partial(self._take, t)) for t, s in self._heard.items()], _LOOKS)
+        if not take_rest([(s, partial(self._take, t)) for t, s in self._heard.items()], _LOOKS):
+            self.get_logger().warning("the last messages were not recorded: too many waited")
 
     def report(self) -> StateReport:
         """Return the messages recorded and lost."""

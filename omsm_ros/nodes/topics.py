@@ -133,33 +133,51 @@ FRAME_PREFIX = Parameter("frame_prefix", "", "before each frame, as cell2/; for 
 
 
 def take_waiting(subscription: Subscription, callback: Callable[[Any, MessageInfo], None]) -> int:
-    """Call ``callback`` for up to some hundreds of waiting messages; return their number."""
-    for count in range(_BULK):
+    """Call ``callback`` for up to some hundreds of waiting messages.
+
+    Return when the last of them was published [ns]; zero without one.
+    """
+    published_ns = 0
+    for _ in range(_BULK):
         with subscription.handle:
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
         if taken is None:
-            return count
+            break
         callback(*taken)
-    return _BULK
+        published_ns = taken[1]["source_timestamp"]
+    return published_ns
 
 
-# Between two looks for messages on their way; for publishers that do not end, the longest time: a
-# launch waits for five seconds [s].
+# Between two looks for messages on their way; the longest time, since a launch waits for five
+# seconds [s].
 _LOOK_S, _LONGEST_S = 0.01, 3.0
 
 
 def take_rest(
     takers: Sequence[tuple[Subscription, Callable[[Any, MessageInfo], None]]], looks: int
-) -> None:
-    """Take the messages on their way at the end, until ``looks`` times none has come.
+) -> bool:
+    """Take the messages published before now that are still on their way.
 
-    A look takes 10 ms. Looks are counted, since a busy computer may give this process no time.
+    The messages of a publisher arrive in order. So all of a topic have come once one has come that
+    was published later, or once its publisher has left, which waits for their acknowledgement. A
+    publisher that does neither has sent no more if nothing has come on any topic in ``looks`` looks
+    of 10 ms each, which are counted since a busy computer may give this process no time. Of several
+    publishers of a topic, one may be behind the other. Return False if messages still came after
+    three seconds.
     """
-    begin, in_vain = time.monotonic(), 0
-    while in_vain < looks and time.monotonic() - begin < _LONGEST_S:
-        came = sum(take_waiting(subscription, take) for subscription, take in takers)
-        in_vain = 0 if came else in_vain + 1
-        time.sleep(_LOOK_S)
+    asked_ns, begin, in_vain = time.time_ns(), time.monotonic(), 0
+    open_topics = list(takers)
+    while open_topics and in_vain < looks and time.monotonic() - begin < _LONGEST_S:
+        in_vain += 1
+        for taker in tuple(open_topics):
+            # Before the look, since the last messages come before a publisher leaves.
+            publishers = taker[0].get_publisher_count()
+            published_ns = take_waiting(*taker)
+            in_vain = 0 if published_ns else in_vain
+            if (publishers == 1 and published_ns > asked_ns) or not (publishers or published_ns):
+                open_topics.remove(taker)
+        time.sleep(_LOOK_S if open_topics else 0.0)
+    return not open_topics or in_vain >= looks
 
 
 def answer_processed_counts(
