@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from omsm_ros.core.streams import statistics
-from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, rms_of, terms_up_to, zernike_values
 from omsm_ros.errors import DataError
@@ -74,7 +74,7 @@ class FormBasis:
 
     On a disc these are Zernike's; elsewhere they are made of Zernike's in their order.
 
-    disc: of the Zernike terms;  mix: of all terms up to order 8 (k, 45)
+    disc: of the Zernike terms, one at the rim;  mix: of all up to order 8 (k, 45)
     group: order of each, or the group of rings (k,)
     """
 
@@ -88,7 +88,7 @@ class FormBasis:
 
         Raises DataError for points at too few places to show any form.
         """
-        values = _zernikes(disc, x, y)
+        values = zernike_values(*disc.scaled(x, y), _TERMS) * _SCALE[:, np.newaxis]
         gram = (values * (area / area.sum())) @ values.T
         rows: list[FloatArray] = []
         groups: list[int] = []
@@ -103,18 +103,14 @@ class FormBasis:
         form = np.array(groups) >= 2
         if not np.any(form):
             raise DataError("registration.no_form")
-        return cls(disc, np.array(rows)[form], np.array(groups)[form])
+        return cls(disc, np.array(rows)[form] * _SCALE, np.array(groups)[form])
 
     def __len__(self) -> int:
         return len(self.group)
 
     def columns(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the polynomials (k, n) at x, y (n,) [m], each with an rms of one over the area."""
-        return np.asarray(self.mix @ _zernikes(self.disc, x, y), np.float64)
-
-
-def _zernikes(disc: Aperture, x: FloatArray, y: FloatArray) -> FloatArray:
-    return np.asarray(zernike_values(*disc.scaled(x, y), _TERMS) * _SCALE[:, np.newaxis])
+        return np.asarray(self.mix @ zernike_values(*self.disc.scaled(x, y), _TERMS), np.float64)
 
 
 @dataclass(eq=False)
@@ -140,8 +136,14 @@ class FormNormalEquations:
         self.scores = np.zeros(self.columns)
 
     def add(self, columns: FloatArray, deviation: FloatArray, systematic: FloatArray,
-            residual: FloatArray) -> None:  # fmt: skip
-        """Add points: columns (q, n), deviation (n,), systematic (s, n), residual (n,)."""
+            residual: FloatArray, near: BoolArray | None = None) -> None:  # fmt: skip
+        """Add points: columns (q, n), deviation (n,), systematic (s, n), residual (n,).
+
+        near: which of them to add (n,), None for all
+        """
+        if near is not None and not np.all(near):
+            columns, systematic = columns[:, near], systematic[:, near]
+            deviation, residual = deviation[near], residual[near]
         self.gram[:, : self.columns] += columns @ columns.T
         self.gram[:, self.columns :] += columns @ np.vstack([deviation, systematic]).T
         self.points += len(deviation)

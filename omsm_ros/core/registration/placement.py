@@ -106,6 +106,8 @@ class Placed(NamedTuple):
 
     def part(self, chosen: BoolArray | IntArray) -> Placed:
         """Return the chosen points (n,)."""
+        if chosen.dtype == np.bool_ and np.all(chosen):
+            return self  # a copy takes as long as the deviations
         return Placed(*(values[..., chosen] for values in self))
 
 

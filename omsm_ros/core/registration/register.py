@@ -317,11 +317,11 @@ class _PoseFit:
             z = self.basis.columns(points.x, points.y)
             columns = np.concatenate([-dof_columns(at, points, self.names), z])
             residual = points.deviation - like @ columns
-            near = np.ones(len(residual), bool)
+            near = None
             if far is not None:
                 near = ~far.add(points, residual, good)
                 beyond[begin + np.flatnonzero(good)[~near]] = True
-            sums.add(columns[:, near], points.deviation[near], systematic[:, near], residual[near])
+            sums.add(columns, points.deviation, systematic, residual, near)
         return PointBatch(*(v[..., beyond] for v in portion))
 
     def solved(self, at: Placement, sums: FormNormalEquations) -> tuple[Estimate, float]:
@@ -356,10 +356,9 @@ class _PoseFit:
             columns = np.concatenate([-dof_columns(at, points, self.names), z])
             like, limit = best_matching_sum(columns, points.deviation)
             residual = points.deviation - like @ columns
-            near = np.abs(residual) <= limit
-            none = np.empty((0, int(near.sum())))
             sums = FormNormalEquations(len(self.names) + len(self.basis), 0)
-            sums.add(columns[:, near], points.deviation[near], none, residual[near])
+            none, near = np.empty((0, len(residual))), np.abs(residual) <= limit
+            sums.add(columns, points.deviation, none, residual, near)
             found, _ = self.solved(at, sums)
             own = np.sqrt(np.diag(sums.gram)[: len(self.names)] / sums.points)
             step = found.step * own
