@@ -185,10 +185,10 @@ ORDER = Quantity("order", "", 0, 40, "0 = choose", whole=True)
 # Machine and surface.
 
 LENGTH = Quantity("length", "m", -10.0, 10.0, "give it in metres")
-RADIUS = Quantity("radius", "m", 1e-6, 1e5, "give it in metres, negative if convex", signed=True)
+RADIUS = Quantity("radius", "m", 1e-6, 1e10, "give it in metres, negative if convex", signed=True)
 FEED = Quantity("feed of a turn", "m", 1e-9, 1.0, "give it in metres")
 SPOT = Quantity("spot", "m", 0.0, 1e-2, "give its diameter in metres")
-FOCAL_LENGTH = Quantity("focal length", "m", 1e-6, 1e5, "give it in metres")
+FOCAL_LENGTH = Quantity("focal length", "m", 1e-6, 1e10, "give it in metres")
 CONIC_CONSTANT = Quantity("conic constant", "", -1e4, 1e4, "0 is a sphere, -1 a paraboloid")
 # Coefficient of a surface term; its square is finite at the largest power and length.
 COEFFICIENT = Quantity("coefficient", "", -1e40, 1e40, "check its unit and its sign")

@@ -77,10 +77,7 @@ def test_a_counter_that_stands_still_is_reported_although_time_goes_on(
     lines = [row.format(7, *(k * 10**6, k)[4 - len(columns) - 1 :]) for k in range(4000)]
     portions = ["".join(lines[i : i + 100]).encode() for i in range(0, 4000, 100)]
     device = CsvStreamDevice(
-        Script(*portions),
-        CsvSettings(columns=columns),
-        lambda: round(now[0] * 1e9),
-        lambda: now[0],
+        Script(*portions), CsvSettings(columns=columns), lambda: round(now[0] * 1e9), lambda: now[0]
     )
     device.open()
 

@@ -172,9 +172,11 @@ def selection(portions: PointBatches, most: int) -> PointBatch:
     return PointBatch(x, y, height, np.empty((0, len(x))))
 
 
-def least_points(x: FloatArray, y: FloatArray) -> int:
+def least_points(points: Placed) -> int:
     """Return how many points a fit needs at least: fewer of a profile than of a map."""
-    spans = sorted(float(np.ptp(v)) for v in (x, y)) if len(x) else [1.0, 1.0]
+    # In the machine's frame a profile is straight, however the part is turned about it.
+    sides = points.from_origin[:2]
+    spans = sorted(float(np.ptp(v)) for v in sides) if len(points.x) else [1.0, 1.0]
     return _LEAST_OF_PROFILE if spans[0] <= _LINE_WIDTH * spans[1] else LEAST_POINTS
 
 
@@ -186,10 +188,10 @@ def inside_aperture(points: Placed, aperture: Aperture | None) -> Placed:
     good = np.isfinite(points.deviation)
     if aperture is not None:
         good &= aperture.holds(points.x, points.y)
-    least = least_points(points.x[good], points.y[good])
-    if (count := int(np.sum(good))) < least:
+    points = points.part(good)
+    if (count := len(points.x)) < (least := least_points(points)):
         raise DataError("registration.few_points", count=count, least=least)
-    extent = max(float(np.ptp(v[good])) for v in (points.x, points.y))
+    extent = max(float(np.ptp(v)) for v in (points.x, points.y))
     if extent < _LEAST_EXTENT_M:
         raise DataError("registration.small_extent", extent=extent)
-    return points.part(good)
+    return points

@@ -85,7 +85,7 @@ def coarse_placement(
             points = points.part(
                 np.abs(middle) <= max(8 * statistics.spread(middle), LEAST_LIMIT_M)
             )
-        if len(points.x) < least_points(points.x, points.y):
+        if len(points.x) < least_points(points):
             break
         columns = -dof_columns(at, points, names)
         scale = np.sqrt(np.mean(columns**2, axis=1))
@@ -167,7 +167,7 @@ def register(
         at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
     except DataError:
         # On a tilted part an undetermined rotation may seem to be determined; seat it first.
-        seat = (*POSE_PARAMETERS[:3], *shape_asked(asked))
+        seat = [n for n in (*POSE_PARAMETERS[:3], *shape_asked(asked)) if n not in dofs.refused]
         seated = coarse_placement(surface, chosen, seat, aperture, start)
         dofs = _determined(surface, chosen, asked, aperture, seated, declared)
         at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)

@@ -25,7 +25,7 @@ ALIASES = {
     "focal_length": "parent_focal_length",
 }
 # Largest radius [m], of a plane, and steps of central differences: relative, and least.
-_FLAT_M, _SHARE, _STEP = 9e4, 1e-4, 1e-5
+_FLAT_M, _SHARE, _STEP = 9e9, 1e-4, 1e-5
 # Least radius at the start, in half widths of the points.
 _LEAST_RADIUS = 1.2
 

@@ -1,5 +1,6 @@
 """Reads and writes text with columns for x, y and height, and profiles of DABAM."""
 
+import codecs
 import io
 import re
 from collections.abc import Iterator, Mapping
@@ -29,6 +30,7 @@ from omsm_ros.units import (
 
 # The greatest number of points of a map, in lines of sixty characters.
 MAX_TEXT_BYTES = 60 * int(MAP_POINTS.high)
+UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _COMMENTS = ("#", "!", "%")
 _LONGEST_HEADER, _LONGEST_LINE = 50, 10_000
 _ROLES = {
@@ -56,15 +58,15 @@ def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
         if (size := stream.seek(0, io.SEEK_END)) > MAX_TEXT_BYTES:
             raise FileError(f"{what} has {size} bytes, at most {MAX_TEXT_BYTES} are read; thin it")
         stream.seek(0)
-        header, first = _beginning(stream, what)
+        encoding = "utf-16" if stream.read(len(UTF_16[0])) in UTF_16 else "utf-8-sig"
+        stream.seek(0)
+        header, first = _beginning(stream, encoding, what)
+        stream.seek(0)
+        body = io.TextIOWrapper(stream, encoding=encoding, errors="replace")
         if sizes := _sizes_of_matrix(header):
-            stream.seek(0)
-            body = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace")
             found = _matrix(body, header, first, sizes, what)
             return replace(found, notes=(NOT_USED,) if units else ())
         names, scales, cells = _columns(header, first, units, what)
-        stream.seek(0)
-        body = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace")
         table = _numbers(body, len(header), first, cells, sorted(names.values()), what)
     unused = cells - len(names)
     notes = [f"{unused} other columns were left out"] if unused > 0 else []
@@ -116,10 +118,11 @@ def _matrix(
     return measured(x, y, table.ravel() * sizes[2])
 
 
-def _beginning(stream: IO[bytes], what: str) -> tuple[list[str], str]:
+def _beginning(stream: IO[bytes], encoding: str, what: str) -> tuple[list[str], str]:
     header: list[str] = []
     # Text also ends lines at CR, as old Macs write; detached, it leaves the stream open.
-    text = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="surrogateescape")
+    errors = "surrogateescape" if encoding == "utf-8-sig" else "replace"
+    text = io.TextIOWrapper(stream, encoding=encoding, errors=errors)
     lines = [*islice(iter(lambda: text.readline(_LONGEST_LINE), ""), _LONGEST_HEADER)]
     text.detach()
     for raw in lines:
@@ -173,6 +176,13 @@ def _columns(
             )
         places = {"x": 0, "height": 1} if count == 2 else {"x": 0, "y": 1, "height": 2}
         named = _of_profile(header, what) if count == 2 else {}
+        for names in map(_names, header if count > 2 else []):
+            found = _named(names) if len(names) == count else {}
+            if any(places.get(role, at) != at for role, (at, _) in found.items()):
+                raise FileError(
+                    f"{what} names its columns {', '.join(names)}, expected x, y and height among "
+                    "them; name the column of the heights z"
+                )
     stated = {role: unit for role, (_, unit) in named.items() if unit is not None}
     scales = dict.fromkeys(places, 1.0)
     for role in places:
@@ -201,7 +211,7 @@ def _of_profile(header: list[str], what: str) -> dict[str, tuple[int, float | No
         if len(names) != 2:
             continue
         roles = [_ROLES.get(name_and_unit(name)[0]) for name in names]
-        if roles[0] not in (None, "x") or roles[1] not in (None, "height"):
+        if roles[0] not in (None, "x") or roles[1] not in (None, "height", "y"):
             raise FileError(
                 f"{what} has 2 columns, expected x, y and height, or x and height; export them so"
             )

@@ -25,7 +25,15 @@ from omsm_ros.errors import FileError
 from omsm_ros.io.child_process import import_optional, read_in_child, walk_in_child
 from omsm_ros.io.files import atomic_file, library_errors, open_regular
 from omsm_ros.quantities import MAP_POINTS, shown
-from omsm_ros.units import LengthUnits, metres_in, needed, refuse_other
+from omsm_ros.units import (
+    MICROMETRE_M,
+    MILLIMETRE_M,
+    NANOMETRE_M,
+    LengthUnits,
+    metres_in,
+    needed,
+    refuse_other,
+)
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 SCHEMA = "omsm-points/1"
@@ -155,6 +163,8 @@ _HEADER_BYTES = 834
 _LARGEST_HEADER = 65_536
 # Phase values from here on are error codes.
 _NO_DATUM = 2_147_483_640
+# Lines of forty characters for each pixel.
+_LONGEST_ZYGO_TEXT = 40 * int(MAP_POINTS.high)
 # Steps of the phase in one fringe, by the entry "phase resolution".
 _STEPS = {0: 4096, 1: 32768, 2: 131072}
 
@@ -185,24 +195,65 @@ def read_metropro(path: Path) -> MeasuredPoints:
             f"{what} has {held} bytes, too few for {columns} × {rows} points; save it again"
         )
     phase = np.frombuffer(raw, ">i4").reshape(rows, columns).astype(np.float64)
-    return _points(head, phase, what)
-
-
-def _points(head: bytes, phase: FloatArray, what: str) -> MeasuredPoints:
-    steps = _STEPS.get(_at(">h", head, 218))
     factors = [_at(">f", head, place) for place in (164, 168, 176)]
+    height, notes = _of_phase(phase, factors, _at(">h", head, 218), what), list[str]()
+    if _at(">h", head, 232):
+        height, notes = -height, ["its sign entry says 'inverted': the heights were negated"]
+    return _of_pixels(height, _at(">f", head, 184), what).points(tuple(notes))
+
+
+def _of_phase(
+    phase: FloatArray, factors: Sequence[float], resolution: int, what: str
+) -> FloatArray:
+    """Return heights [m];  factors: scale, wavelength [m], and obliquity."""
+    steps = _STEPS.get(resolution)
     if steps is None or not np.all(np.isfinite(factors)) or min(map(abs, factors)) <= 0:
         raise FileError(f"{what} does not say how high a fringe is; export it again with its scale")
-    scale = float(np.prod(factors)) / steps
-    notes: tuple[str, ...] = ()
-    if _at(">h", head, 232):
-        scale, notes = -scale, ("its sign entry says 'inverted': the heights were negated",)
-    pixel = _at(">f", head, 184)
+    return np.where(phase >= _NO_DATUM, np.nan, phase * (float(np.prod(factors)) / steps))
+
+
+def _of_pixels(height: FloatArray, pixel: float, what: str) -> HeightGrid:
     if not (np.isfinite(pixel) and pixel > 0):
         raise FileError(f"{what} has no lateral calibration; calibrate the camera and save again")
-    height = np.where(phase >= _NO_DATUM, np.nan, phase * scale)
-    grid = HeightGrid(height=np.flipud(height), x0=0.0, y0=0.0, dx=pixel, dy=pixel)
-    return grid.points(notes)
+    return HeightGrid(height=np.flipud(height), x0=0.0, y0=0.0, dx=pixel, dy=pixel)
+
+
+ZYGO_TEXT = (b"Zygo XYZ Data File - Format 1", b"Zygo ASCII Data File - Format 2")
+"""First lines of the two texts that MetroPro and Mx export, by the MetroPro Reference Guide."""
+
+
+def read_zygo_text(path: Path) -> MeasuredPoints:
+    """Read column, row and height [µm] of each pixel (format 1), or phases by rows (format 2).
+
+    Raises FileError for an incomplete file, or one without its scales.
+    """
+    what = f"Zygo file {str(path)!r}"
+    with open_regular(path, FileError, "Zygo file") as stream:
+        text = stream.read(_LONGEST_ZYGO_TEXT).decode("latin-1").replace("\r\n", "\n")
+    head, *parts = re.split(r"^# *$", text, flags=re.MULTILINE)
+    phases = head.startswith("Zygo ASCII")
+    try:
+        if parts[-1].strip():
+            raise ValueError("no mark of the end")
+        lines = [line.split() for line in head.splitlines()]
+        left, top, columns, rows = map(int, lines[3][:4])
+        optical, resolution = [*map(float, lines[7][1:7])], int(lines[10][0])
+        MAP_POINTS.checked(columns * rows, FileError, f"{what}: number of points")
+        body = max(parts[1:], key=len) if phases else parts[0]
+        height = np.array(body.replace("No Data", "nan").split(), np.float64)
+        if phases:
+            height = height.reshape(rows, columns)
+        else:
+            places = height.reshape(-1, 3).T
+            column, row = (places[:2] - np.array([[left], [top]])).astype(np.int64)
+            height = np.full((rows, columns), np.nan)
+            height.flat[np.ravel_multi_index((row, column), (rows, columns))] = places[2]
+            height *= MICROMETRE_M
+    except (ValueError, IndexError) as err:
+        raise FileError(f"{what} is damaged or was cut short; export it again") from err
+    if phases:
+        height = _of_phase(height, [*optical[:2], optical[3]], resolution, what)
+    return _of_pixels(height, optical[5], what).points(())
 
 
 def _at(form: str, head: bytes, place: int) -> Any:
@@ -212,6 +263,8 @@ def _at(form: str, head: bytes, place: int) -> Any:
 # Readers of SurfaceTopography whose first row has the least y: of standards that say so, and of
 # places. All others begin with the upper row of the image, as Gwyddion does.
 _UPWARDS = ("SDFReader", "XYZReader", "NCReader")
+# No microscope has such pixels; its release 1.27 takes the nanometres of NanoFocus for millimetres.
+_LARGEST_PIXEL_M = 1e-3
 
 
 def read_foreign(
@@ -260,11 +313,12 @@ def _by_topography(
         )
     if found.physical_sizes is None:
         raise FileError(f"{what} is no map with its size; convert it to xyz")
-    dx, dy = (size / count for size, count in zip(found.physical_sizes, height.shape, strict=True))
+    sizes = zip(found.physical_sizes, height.shape, strict=True)
+    dx, dy = (size / count * scale.lateral for size, count in sizes)
+    if type(reader).__name__ == "NMSReader" and min(dx, dy) > _LARGEST_PIXEL_M:
+        dx, dy = (size * NANOMETRE_M / MILLIMETRE_M for size in (dx, dy))
     rows = height.T if type(reader).__name__ in _UPWARDS else np.flipud(height.T)
-    return HeightGrid(
-        height=rows * scale.height, x0=0.0, y0=0.0, dx=dx * scale.lateral, dy=dy * scale.lateral
-    ).points(notes)
+    return HeightGrid(height=rows * scale.height, x0=0.0, y0=0.0, dx=dx, dy=dy).points(notes)
 
 
 def _holds_heights(channel: Any) -> bool:

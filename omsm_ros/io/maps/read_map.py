@@ -1,6 +1,5 @@
 """Reads a map of any known format as points in metres."""
 
-import codecs
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +7,7 @@ from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError, FileError
 from omsm_ros.io.files import CLOUD, exception_text, open_regular
 from omsm_ros.io.maps import instrument_files
-from omsm_ros.io.maps.columns_file import has_dabam_header, read_columns, read_dabam
+from omsm_ros.io.maps.columns_file import UTF_16, has_dabam_header, read_columns, read_dabam
 from omsm_ros.io.maps.grid_sag_file import is_grid_sag, read_grid_sag
 from omsm_ros.io.maps.instrument_files import read_foreign, read_x3p
 from omsm_ros.io.maps.vertex_file import read_cloud
@@ -16,7 +15,6 @@ from omsm_ros.units import NOT_USED, LengthUnits
 
 _HEAD_BYTES = 4096
 _BAGS = (b"\x89MCAP0\r\n", b"#ROSBAG V")
-_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _GRID_SAG_SUFFIXES = (".dat", ".grd")
 _TEXT_SUFFIXES = (".xyz", ".txt", ".asc", ".csv", ".dat", ".tsv")
 
@@ -54,14 +52,12 @@ def _head(path: Path) -> bytes:
             f"{str(path)!r} is a bag, no map; make points of it with 'omsm correct', or give "
             "'omsm form' its --calibration, too; one of ROS 1 needs 'omsm import' first"
         )
-    if head.startswith(_UTF_16):
-        raise FileError(f"map {str(path)!r} is text in UTF-16; save it as UTF-8")
     return head
 
 
 def _read(path: Path, units: LengthUnits | None, channel: str | None) -> MeasuredPoints:
     head, suffix = _head(path), path.suffix.lower()
-    text = b"\0" not in head
+    text = b"\0" not in head or head.startswith(UTF_16)
     if head.startswith(instrument_files.MAGIC):
         return _in_own_units(instrument_files.read_hdf5(path, channel), units)
     if suffix == ".x3p":
@@ -71,6 +67,8 @@ def _read(path: Path, units: LengthUnits | None, channel: str | None) -> Measure
         points = read_cloud(path, units)
     elif head.startswith(instrument_files.METROPRO_MAGIC):
         points = _in_own_units(instrument_files.read_metropro(path), units)
+    elif head.startswith(instrument_files.ZYGO_TEXT):
+        points = _in_own_units(instrument_files.read_zygo_text(path), units)
     elif has_dabam_header(path):
         points = _in_own_units(read_dabam(path), units)
     elif text and suffix in _GRID_SAG_SUFFIXES and is_grid_sag(*_first_lines(head)):

@@ -8,7 +8,7 @@ from omsm_ros.core.form.analyse import analyse_form
 from omsm_ros.core.registration.placement import PointBatch
 from omsm_ros.core.registration.register import register
 from omsm_ros.core.surface.aspheres import Asphere, Sphere, Toroid
-from omsm_ros.core.surface.nominal import OffAxisParaboloid
+from omsm_ros.core.surface.nominal import Flat, OffAxisParaboloid
 from omsm_ros.core.surface.posed import Pose, PosedSurface
 from omsm_ros.core.surface.shape_parameters import external
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex
@@ -104,3 +104,18 @@ def test_a_conic_constant_holds_what_spherical_aberration_of_the_part_makes_of_i
         for h in (height, height + aberration)
     )
     assert 1e-3 < abs(changed - value) < 2 * spread
+
+
+@pytest.mark.parametrize("count", [60, 350])
+@pytest.mark.parametrize("radius", [2e6, -3e5, 40.0])
+def test_a_profile_has_a_radius_however_flat_and_with_few_points(count, radius):
+    """A mirror of half a metre with the sagitta of 2e6 m, 16 nm, is no plane."""
+    along = np.linspace(-0.25, 0.25, count)
+    form = 5e-9 * np.cos(13 * along / 0.25) + 3e-4 * along
+    height = Sphere(radius).height(along, 0 * along) + form
+    batch = PointBatch(along, 0 * along, height, np.empty((0, count)))
+    found = register(Sphere(1.0), lambda: [batch], ("auto", "radius"))
+    ((_, curvature),) = found.placement.shape
+    assert abs(curvature - 1 / radius) < 2 * found.spread["radius"] < 1e-5
+    flat = register(Flat(), lambda: [batch], ("auto",))
+    assert "clocking" in flat.dofs.refused

@@ -60,6 +60,14 @@ def test_a_plane_keeps_its_slopes_and_its_size(map_of, reader, upwards):
     assert np.ptp(points.y) == pytest.approx(12e-6)
 
 
+@pytest.mark.parametrize("mistaken", [1e6, 1.0])
+def test_pixels_of_nanofocus_are_those_of_a_microscope(map_of, mistaken):
+    """SurfaceTopography 1.27 takes the nanometres of the file for millimetres."""
+    points = read_points(map_of(reader="NMSReader", sizes=tuple(mistaken * v for v in SIZES)))
+    assert np.ptp(points.x) == pytest.approx(38e-6)
+    assert np.ptp(points.y) == pytest.approx(12e-6)
+
+
 def test_lost_places_are_no_points(map_of):
     heights = np.ma.masked_less(np.arange(100.0).reshape(PLACES), 10.0)
     heights[-1, -1] = -np.finfo(np.float64).max  # the mark of SDF for a missing double

@@ -117,11 +117,24 @@ def test_a_grid_sag_with_a_mark_of_the_encoding_is_one(tmp_path):
 
 
 @pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
-def test_text_in_utf_16_is_reported(tmp_path, encoding):
-    path = tmp_path / "map.dat"
-    path.write_bytes("\ufeff0 0 5\n1 0 6\n".encode(encoding))
-    with pytest.raises(FileError, match=r"map.dat' is text in UTF-16; save it as UTF-8"):
+def test_text_in_utf_16_is_read(tmp_path, encoding):
+    path = tmp_path / "map.csv"
+    text = "\ufeffx in µm,y in mm,z in nm\n0,0,5\n1,2,6\n"
+    path.write_bytes(text.encode(encoding))
+    points = read_points(path)
+    assert points.x == pytest.approx([0, 1e-6])
+    assert points.y == pytest.approx([0, 2e-3])
+    assert points.height == pytest.approx([5e-9, 6e-9])
+    path.write_bytes(text.encode(encoding)[:-1])
+    with pytest.raises(FileError, match="is no row of numbers"):
         read_points(path)
+
+
+def test_two_columns_x_and_y_are_a_profile(tmp_path):
+    """A file without heights would be no map, so that y is the height, as of a stylus."""
+    points = read_points(_text(tmp_path, "x in mm,y in µm\n0,3\n1,4\n", "map.csv"))
+    assert points.height == pytest.approx([3e-6, 4e-6])
+    assert points.notes == ("a profile along x",)
 
 
 def test_a_height_that_is_missing_is_counted(tmp_path):
@@ -134,7 +147,8 @@ def test_a_height_that_is_missing_is_counted(tmp_path):
     [
         ("", "is empty"),
         ("hello\nworld\n", "no line of numbers"),
-        ("x_mm y_mm\n1 2\n3 4\n", "has 2 columns, expected x, y and height"),
+        ("y_mm z_mm\n1 2\n3 4\n", "has 2 columns, expected x, y and height"),
+        ("index,x,y\n0,1,2\n1,3,4\n", "index, x, y, expected x, y and height among them"),
         ("x_m y_m z_m\n1 2 3\n4 5 six\n", "is no row of numbers.*decimal points"),
         ("x_m;y_m;z_m\n1.5;2.5;3.5\n1,5;2,5;3,5\n", "is no row of numbers.*decimal points"),
         ("x_m y_m z_m\n1 2 3\n4 5\n", "line 3: '4 5' is no row"),
