@@ -54,7 +54,7 @@ def uneven_rows(problem: Problem, columns: FloatArray, scatter: float) -> FloatA
     """
     rows, used = [np.zeros((0, columns.shape[1]))], problem.used
     rate = rate_of(problem)[used]
-    if problem.plateau is not None and problem.shared > 0:
+    if problem.plateau is not None and problem.shared + problem.input_shared > 0:
         # One rounding error for each plateau, one for each reading while moving. It has the
         # variance of its first harmonic times π²/6, which is Σ 1/k².
         plateau = problem.plateau[used]
@@ -62,6 +62,9 @@ def uneven_rows(problem: Problem, columns: FloatArray, scatter: float) -> FloatA
         np.add.at(sums, plateau + 1, columns)
         moving = np.pi / np.sqrt(6) * columns[plateau < 0]
         rows.append(np.sqrt(problem.shared) * np.concatenate([sums[1:], moving]))
+        # Steps of whole counts leave the axis at one place between two counts on every plateau.
+        every = np.concatenate([sums[1:], np.sum(sums[1:], axis=0, keepdims=True)])
+        rows.append(np.sqrt(problem.input_shared) * every)
     wrong = motion_error_variance(problem)[used]
     rows.append(np.sqrt(wrong[wrong > 0])[:, np.newaxis] * columns[wrong > 0])
     if scatter > 0:

@@ -96,6 +96,7 @@ class Problem:
     plateau: number of the plateau of a sample, (n,), -1 elsewhere; or None
     shared: variance of the rounding error that the readings of a plateau share [m²]
     input_error: variance of the error of the input while it moves [m²]: rounding, and noise
+    input_shared: variance of the rounding error that its readings of a plateau share [m²]
     errors_in_variables: noise that was taken out of the input and that the probe does not follow,
         (n,) [m]; or None
     recorded: the input as it was, (n,) [m], where noise was taken out of it
@@ -114,6 +115,7 @@ class Problem:
     plateau: IntArray | None = None
     shared: float = 0.0
     input_error: float = 0.0
+    input_shared: float = 0.0
     errors_in_variables: FloatArray | None = None
     recorded: FloatArray | None = None
 

@@ -90,9 +90,14 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
 
 def _with_reading_steps(problem: Problem, steps: Steps) -> Problem:
     plateau, output = plateaus(steps, problem.used), problem.output[problem.used]
-    shared = plateau_variance(output, plateau[problem.used], reading_step(output))
     step = reading_step(problem.input)
-    return replace(problem, plateau=plateau, shared=shared, input_error=step**2 / 12)
+    return replace(
+        problem,
+        plateau=plateau,
+        shared=plateau_variance(output, plateau[problem.used], reading_step(output)),
+        input_error=step**2 / 12,
+        input_shared=plateau_variance(problem.input, plateau, step),
+    )
 
 
 def _motion(record: MotionRecord, source: str) -> FloatArray:

@@ -87,3 +87,26 @@ def test_an_axis_that_scatters_is_named_as_the_cause():
     reported = [*map(str, certificate.reasons), *map(str, certificate.reservations)]
     assert any("readings of the axis scatter in time" in text for text in reported)
     assert not any("loose" in text for text in map(str, certificate.reasons))
+
+
+def staircase(time, starts):
+    """Positions (n,) [m] of ten steps of 10 µm up and ten down, each from one of ``starts`` on."""
+    phase = np.clip((time[:, np.newaxis] - starts) / 20e-3, 0, 1)
+    heights = np.where(np.arange(len(starts)) < len(starts) / 2, 10e-6, -10e-6)
+    return (phase**3 * (10 - 15 * phase + 6 * phase**2)) @ heights
+
+
+@pytest.mark.parametrize("seed", [0, *soaked(1, 2)])
+@pytest.mark.parametrize("place", [0.4, *soaked(0.25, 0.45)])
+def test_counts_that_every_plateau_rounds_alike_are_no_machine_error(place, seed):
+    """Steps of whole counts: at rest all readings are wrong by the same part of a count."""
+    rng = np.random.default_rng(seed)
+    starts = 0.4 + 0.52 * np.arange(20) + rng.uniform(0, PERIOD, 20)
+    time = np.arange(0.0, starts[-1] + 0.5, PERIOD)
+    z = 10e-9 * np.round(staircase(time, starts) / 10e-9 + place)
+    seen = staircase(time - LAG_S, starts) + rng.normal(0, 5e-9, len(time))
+    calibration = identify(record_from_arrays(PERIOD, z, -seen)).calibration
+    assert str(calibration.certificate.verdict) == "accepted"
+    assert calibration.certificate.reservations == ()
+    late = calibration.dynamics.low_frequency_delay
+    assert abs(late - LAG_S) < 2 * calibration.low_frequency_delay_uncertainty
