@@ -68,7 +68,6 @@ _PLACES = {
     "_LEAST_DECAYS": f"{_IDENTIFICATION}.model_error_search",
     "_PLAIN_POLES": f"{_IDENTIFICATION}.model_error_search",
     "_SETTLED_DECAYS": f"{_IDENTIFICATION}.model_error_search",
-    "_SAME_LINE": f"{_IDENTIFICATION}.model_error_search",
 }
 
 

@@ -48,13 +48,8 @@ _LEAST_DECAYS = 1.0
 _SETTLED_DECAYS = 7.0
 # Most poles of a simple model, a structure and its roll-off; nonlinearity looks like many more.
 _PLAIN_POLES = 2
-# Factors on poles at which a fit starts: time constants a decade apart look similar, and tested
-# modes are six per cent apart.
-_FASTER = (1.0, 2.0, 5.0)
+# Factors on the poles of a mode at which a fit starts: tested modes are six per cent apart.
 _MODE_FREQUENCY_RATIOS = (1.0, 0.97, 1.03)
-# Logarithm of the frequency ratio within which a line belongs to a mode: a mode of that width rings
-# seven times.
-_SAME_LINE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +100,6 @@ def search_model_errors(
     diagnostics = search.diagnostics()
     for _ in range(_MOST_ROUNDS):
         shown = diagnostics.significant(search.refused | search.settled)
-        shown = _without_modelled_lines(shown, search.modes)
         # Without budget a nuisance term is still fitted to the structure that was chosen.
         if not shown or (search.budget.stops() and shown[0].term.family not in _NUISANCE_FAMILIES):
             break
@@ -129,7 +123,6 @@ class _Search:
 
     refused: families whose poles were no improvement
     settled: families whose columns were recomputed for the response
-    modes: frequencies that were tried as poles [Hz]
     grown, without: terms that became poles since the last nuisance term, and the diagnostics before
     """
 
@@ -140,7 +133,6 @@ class _Search:
     budget: EvaluationBudget
     refused: set[str] = field(default_factory=set)
     settled: set[str] = field(default_factory=set)
-    modes: list[float] = field(default_factory=list)
     grown: list[ModelErrorTerm] = field(default_factory=list)
     without: list[ResidualDiagnostics] = field(default_factory=list)
 
@@ -171,8 +163,6 @@ class _Search:
 
     def _add_poles(self, diagnostics: ResidualDiagnostics, term: ModelErrorTerm) -> bool:
         larger = _grown(self.prepared, self.model, term, self.budget)
-        if term.family == MODE:
-            self.modes.append(term.parameter)
         if larger is None:
             self.refused.add(term.family)
             return False
@@ -281,20 +271,6 @@ def _improving_terms(
     return columns if better else []
 
 
-def _without_modelled_lines(shown: Sequence[ScoreTest], modes: Sequence[float]) -> list[ScoreTest]:
-    """Return ``shown`` without lines of vibration at ``modes`` [Hz] that described more.
-
-    A lightly damped mode that the steps keep exciting looks like a line, and a badly fitted one
-    leaves a line. As a nuisance term it would be missing in the response.
-    """
-    return [
-        judged
-        for judged in shown
-        if judged.term.family != VIBRATION
-        or all(abs(np.log(judged.term.parameter / mode)) > _SAME_LINE for mode in modes)
-    ]
-
-
 def _select_nuisance_terms(
     diagnostics: ResidualDiagnostics, shown: Sequence[ScoreTest]
 ) -> list[ScoreTest]:
@@ -356,7 +332,7 @@ def _grown(
     if term.family == CREEP or np.min(-new.real) * duration < _SETTLED_DECAYS:
         # The response to the end of the record reaches the start of the period.
         problem = replace(problem, fits_initial_condition=True)
-    starts = _FASTER if term.family == CREEP else _MODE_FREQUENCY_RATIOS
+    starts = (1.0,) if term.family == CREEP else _MODE_FREQUENCY_RATIOS
     tried = [fit_with_added_poles(problem, base, new, starts, budget) for base in _bases(model)]
     # The chosen model may have poles for what ``term`` describes: fewer may suffice with it.
     found = [
