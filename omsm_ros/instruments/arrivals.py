@@ -24,6 +24,8 @@ _DRIFT_SIGMA = 50 * PPM
 # A drift beyond this by five of its standard uncertainties is not that of a crystal: the device
 # is played faster than it was recorded, or set to another rate.
 _LARGEST_CRYSTAL_DRIFT = 1000 * PPM
+# How unlikely such a drift is beforehand (log), or missed triggers would be taken for one.
+_OTHER_RATE = 12.0
 # Points that show a gross drift, and any other one.
 _LEAST_POINTS, _SURE_POINTS = 6, 9
 # A clock was set if all arrivals are late, by the first more than usual, for the second time [s].
@@ -142,7 +144,8 @@ def _line_below(x: FloatArray, y: FloatArray) -> tuple[float, float, FloatArray,
     unlikely = ((slopes - drift) / uncertainty) ** 2 / 2
     best = np.argmin(len(x) * _SPAN_S * np.log(mean) + unlikely)
     offset, slope = float(offsets[best]), float(slopes[best])
-    return offset, slope, y - slope * x - offset, float(unlikely[best])
+    other_rate = _OTHER_RATE if drift else 0.0
+    return offset, slope, y - slope * x - offset, float(unlikely[best]) + other_rate
 
 
 def _slopes_below(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -187,8 +190,6 @@ _SPANS, _LATEST = 50, 60
 _LEAST_SPANS, _SHOWING, _OPEN = 8, 3, 5
 # Missed triggers are excluded, not likelier than none, and of a certain number by this (log).
 _EXCLUDED, _POSSIBLE, _CERTAIN = 6.0, 1.0, 12.0
-# Without a reference for longer, it is the scatter of the arrivals that hides missed triggers [s].
-_SCATTERED_S = 8.0
 # Without a reference, so short a time before a pause is taken to be without missed triggers [s].
 _UNKNOWN_S = 1.0
 # The last sample of a portion may be nearly a period old: the lateness that confirms [period].
@@ -364,8 +365,11 @@ class _Reference:
             if waited < 0.7 * _UNKNOWN_S:  # else the end of a recording stays in doubt
                 return
             self._limit, self.seen_from = math.inf, 0
-        elif not self.proven and waited > _SCATTERED_S:
+        elif not self.proven:
             self._set_limit(rest)
+            other_rate = abs(drift) > _LARGEST_CRYSTAL_DRIFT and waited < _LEAST_SPAN_S
+            if other_rate or self.seen_from > 1:  # either would hide a missed trigger
+                return
         missed = self._settle(known) if self.seen_from else 0
         if missed == 0 or (missed and self.proven):
             self.proven, self.confirmed = True, self._judged

@@ -182,8 +182,8 @@ class StreamDevice:
         if self._cutter.unconfirmed:
             return (
                 f"{self._transport.name}: all samples arrive late, as after missed triggers or at "
-                "another rate, and are withheld: if this lasts, check sample_period, then restart "
-                "the counters of both devices together"
+                "another rate, or too unevenly to show missed ones, and are withheld: if this "
+                "lasts, check sample_period, then restart the counters of both devices together"
             )
         if self._cutter.wrong_rate:
             return (

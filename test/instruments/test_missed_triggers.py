@@ -88,15 +88,18 @@ class Outcome:
     waited: int
 
 
-def run(seed: int, missed: int, busy: float = 0.0) -> Outcome:
+def run(
+    seed: int, missed: int, busy: float = 0.0, when: tuple[float, float] = (3.5, 5.0)
+) -> Outcome:
     """Miss ``missed`` triggers at a random time, with portions of 2 to 50 ms.
 
     busy: mean delay of most reads by a host that is busy now and then [s]
+    when: range of the time [s]
     """
     random = np.random.default_rng(seed)
     true = np.arange(round(SECONDS / PERIOD))
     taken = true * PERIOD * (1 + random.uniform(-50e-6, 50e-6))
-    at = int(random.uniform(3.5, 5.0) / PERIOD)
+    at = max(int(random.uniform(*when) / PERIOD), 1)
     seen = np.concatenate([true[:at], true[at + missed :]])
     axes, probe = lines(seen), frames(true, taken)
     portion = float(random.choice([0.002, 0.005, 0.01, 0.02, 0.05]))
@@ -203,6 +206,15 @@ def test_nor_is_one_on_a_busy_host(seed: int) -> None:
     assert outcome.withheld + outcome.waited > 0
 
 
+@pytest.mark.parametrize(
+    ("seed", "until"), [(41, 0.5), *((seed, (0.25, 1.0, 5.0)[seed % 3]) for seed in range(CASES))]
+)
+def test_nor_is_one_after_a_trigger_missed_soon_after_the_start(seed: int, until: float) -> None:
+    """Several missed in the first second look like another rate of the device."""
+    outcome = run(seed, 1 + seed % 3, when=(0.0, until))
+    assert outcome.wrong == 0, outcome
+
+
 def test_a_busy_host_alone_costs_no_sample() -> None:
     outcome = run(0, 0, busy=0.01)
     assert (outcome.withheld, outcome.missed) == (0, 0)
@@ -264,13 +276,24 @@ def test_a_busy_host_tells_later_how_many_were_missed(quick: float, latest: floa
     assert certain < latest
 
 
-def test_what_the_arrivals_cannot_show_is_stated() -> None:
+def test_what_the_arrivals_cannot_show_is_stated_and_confirms_nothing() -> None:
     """Even the earliest of all arrivals of a second is late by more than two periods."""
     random, detector = np.random.default_rng(2), MissedTriggerDetector(PERIOD)
-    due = np.arange(1, 1000) * 0.01
-    for d, a in zip(due, np.maximum.accumulate(due + random.uniform(0, 0.1, 999)), strict=True):
-        detector.confirms(float(d), UPTIME_S + float(a))
+    due = np.arange(1, 2000) * 0.01
+    for d, a in zip(due, np.maximum.accumulate(due + random.uniform(0, 0.1, 1999)), strict=True):
+        assert not detector.confirms(float(d), UPTIME_S + float(a))
     assert detector.seen_from > 3
+
+
+@pytest.mark.parametrize("deviation", [0.005, 0.02])
+def test_another_rate_is_confirmed_once_the_arrivals_show_it(deviation: float) -> None:
+    detector = MissedTriggerDetector(PERIOD)
+    confirmed = [
+        detector.confirms(due, UPTIME_S + due * (1 + deviation))
+        for due in (np.arange(1, 1000) * 0.01).tolist()
+    ]
+    assert not any(confirmed[:400])
+    assert all(confirmed[-200:])
 
 
 def cut(

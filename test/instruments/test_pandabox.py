@@ -208,6 +208,85 @@ def test_the_next_capture_begins_by_itself_when_the_enable_falls(panda, device):
     assert (device.statistics.restarts, device.statistics.lost) == (1, 0)
 
 
+def test_it_is_armed_once_the_last_capture_was_sent(panda, device):
+    panda.trigger(30)
+    poll_until(device, 30)
+    panda.answers["*PCAP.ARM="] = "ERR Data clients still taking data"
+    panda.finish("Ok")
+    later = threading.Timer(0.1, panda.answers.clear)
+    later.start()
+    while not panda.busy:
+        device.poll(0.02)
+    later.join()
+    panda.trigger(30)
+    poll_until(device, 60)
+    assert (device.statistics.restarts, device.statistics.lost) == (1, 0)
+
+
+class Lateness(threading.Thread):
+    """By how much a thread of this machine is late in all [s], so that its load is no fault."""
+
+    def __init__(self):
+        super().__init__(daemon=True)
+        self.seconds, self.over = 0.0, threading.Event()
+
+    def run(self):
+        while not self.over.is_set():
+            begin = time.monotonic()
+            time.sleep(0.01)
+            self.seconds += time.monotonic() - begin - 0.01
+
+    def __enter__(self):
+        self.start()
+        return self
+
+    def __exit__(self, *_):
+        self.over.set()
+        self.join()
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.25, 1.0, 5.0])
+def test_it_is_back_two_seconds_after_any_drop(panda, device, seconds):
+    """The box keeps measuring, and its buffer holds what was latched meanwhile."""
+    blocks, stop, over = [], threading.Event(), threading.Event()
+    reader = DeviceReader(device, blocks.extend)
+    device.close()
+    threads = [threading.Thread(target=reader.run, args=(stop,))]
+    threads.append(threading.Thread(target=trigger_evenly, args=(panda, over)))
+    threads[0].start()
+    try:
+        wait_for(lambda: reader.connections == 1)
+        threads[1].start()
+        wait_for(lambda: device.decoded >= 300)
+        panda.drop(seconds)
+        back, before = time.monotonic(), device.decoded
+        with Lateness() as late:
+            wait_for(lambda: device.decoded > before and reader.connections == 2)
+            took = time.monotonic() - back - late.seconds
+        over.set()
+        wait_for(lambda: device.decoded == panda.captured)
+    finally:
+        over.set()
+        stop.set()
+        for thread in threads:
+            if thread.ident:
+                thread.join()
+    assert took <= 2.0
+    found = device.statistics
+    assert (found.lost, found.duplicates, found.restarts) == (0, 0, 0)
+    assert found.decoded == found.delivered == panda.captured
+    seen = np.concatenate([b.axes.first_sample + np.arange(len(b.axes.x)) for b in blocks])
+    np.testing.assert_array_equal(seen, np.arange(panda.captured))
+
+
+def trigger_evenly(panda, over):
+    begin, done = time.monotonic(), 0
+    while not over.wait(0.01):
+        due = round((time.monotonic() - begin) / PERIOD)
+        panda.trigger(due - done)
+        done = due
+
+
 @pytest.mark.parametrize("silently", [False, True])
 def test_it_is_armed_again_after_a_power_cycle(panda, device, silently):
     notes, blocks, stop = [], [], threading.Event()

@@ -289,7 +289,14 @@ class PandaBox:
         return int(said)
 
     def _arm(self) -> None:
-        self._ask(_pandablocks().commands.Arm())
+        deadline, armed = time.monotonic() + _ANSWER_S, False
+        while not armed:
+            try:
+                armed = self._ask(_pandablocks().commands.Arm()) is None
+            except DeviceError as err:  # the last capture is still being sent to its clients
+                if "still taking data" not in str(err) or time.monotonic() > deadline:
+                    raise
+                time.sleep(_POLL_S)
         self._armed, self._next, self._at, self._captured = "", 0, 0, 0
 
     def _ask(self, command: Any) -> Any:
