@@ -24,8 +24,9 @@ _DRIFT_SIGMA = 50 * PPM
 # A drift beyond this by five of its standard uncertainties is not that of a crystal: the device
 # is played faster than it was recorded, or set to another rate.
 _LARGEST_CRYSTAL_DRIFT = 1000 * PPM
-# How unlikely such a drift is beforehand (log), or missed triggers would be taken for one.
-_OTHER_RATE = 12.0
+# How unlikely such a drift is beforehand (log), and the time of arrivals that shows it [s], or
+# missed triggers would be taken for one.
+_OTHER_RATE, _OTHER_RATE_S = 12.0, 2.0
 # Points that show a gross drift, and any other one.
 _LEAST_POINTS, _SURE_POINTS = 6, 9
 # A clock was set if all arrivals are late, by the first more than usual, for the second time [s].
@@ -367,7 +368,7 @@ class _Reference:
             self._limit, self.seen_from = math.inf, 0
         elif not self.proven:
             self._set_limit(rest)
-            other_rate = abs(drift) > _LARGEST_CRYSTAL_DRIFT and waited < _LEAST_SPAN_S
+            other_rate = abs(drift) > _LARGEST_CRYSTAL_DRIFT and waited < _OTHER_RATE_S
             if other_rate or self.seen_from > 1:  # either would hide a missed trigger
                 return
         missed = self._settle(known) if self.seen_from else 0

@@ -292,7 +292,7 @@ def test_another_rate_is_confirmed_once_the_arrivals_show_it(deviation: float) -
         detector.confirms(due, UPTIME_S + due * (1 + deviation))
         for due in (np.arange(1, 1000) * 0.01).tolist()
     ]
-    assert not any(confirmed[:400])
+    assert not any(confirmed[:200])
     assert all(confirmed[-200:])
 
 
