@@ -127,7 +127,7 @@ def exception_text(err: Exception) -> str:
     if isinstance(err, _LIBRARY_ERRORS):
         return "its content is inconsistent"
     text = err.strerror if isinstance(err, OSError) and err.strerror else str(err)
-    return " ".join(text.split())[:200] or type(err).__name__
+    return " ".join(text.split())[:200].rstrip(".") or type(err).__name__
 
 
 @contextmanager

@@ -316,6 +316,8 @@ class CorrectorNode(ManagedNode):
         self, request: LoadCalibration.Request, response: LoadCalibration.Response
     ) -> None:
         response.id = self._in_force_id()
+        if not request.path:
+            raise CalibrationError("no path is given; name a file of a calibration, CAL.json")
         folders = self.values["calibration_folders"]
         path = resolved_within(Path(request.path), folders, CalibrationError, "calibration")
         calibration = await self._worker.do(partial(load_for_others, path))

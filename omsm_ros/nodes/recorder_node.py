@@ -31,7 +31,7 @@ PARAMETERS = (
 )
 _FLUSH_PERIOD_S = 0.5
 # Longer than the corrector waits for its last samples, whose points come after that.
-_LOOKS = 40
+_LOOKS = 100
 
 
 class RecorderNode(ManagedNode):

@@ -133,10 +133,7 @@ FRAME_PREFIX = Parameter("frame_prefix", "", "before each frame, as cell2/; for 
 
 
 def take_waiting(subscription: Subscription, callback: Callable[[Any, MessageInfo], None]) -> int:
-    """Call ``callback`` for up to some hundreds of waiting messages.
-
-    Return when the last of them was published [ns]; zero without one.
-    """
+    """Take some hundreds of waiting messages at most; return when the last was published [ns]."""
     published_ns = 0
     for _ in range(_BULK):
         with subscription.handle:
@@ -149,23 +146,23 @@ def take_waiting(subscription: Subscription, callback: Callable[[Any, MessageInf
 
 
 # Between two looks for messages on their way; the longest time, since a launch waits for five
-# seconds [s].
-_LOOK_S, _LONGEST_S = 0.01, 3.0
+# seconds [s]. All nodes of a launch get its signal within this time [ns].
+_LOOK_S, _LONGEST_S, _TOGETHER_NS = 0.01, 3.0, 500_000_000
 
 
 def take_rest(
     takers: Sequence[tuple[Subscription, Callable[[Any, MessageInfo], None]]], looks: int
 ) -> bool:
-    """Take the messages published before now that are still on their way.
+    """Take the messages still on their way, and those of publishers that end at the same time.
 
     The messages of a publisher arrive in order. So all of a topic have come once one has come that
-    was published later, or once its publisher has left, which waits for their acknowledgement. A
-    publisher that does neither has sent no more if nothing has come on any topic in ``looks`` looks
-    of 10 ms each, which are counted since a busy computer may give this process no time. Of several
-    publishers of a topic, one may be behind the other. Return False if messages still came after
-    three seconds.
+    was published half a second later, or once its publisher has left, which waits for their
+    acknowledgement. A publisher that does neither has sent no more if nothing has come on any topic
+    in ``looks`` looks of 10 ms each, which are counted since a busy computer may give this process
+    no time. Of several publishers of a topic, one may be behind the other. Return False if messages
+    still came after three seconds.
     """
-    asked_ns, begin, in_vain = time.time_ns(), time.monotonic(), 0
+    until_ns, begin, in_vain = time.time_ns() + _TOGETHER_NS, time.monotonic(), 0
     open_topics = list(takers)
     while open_topics and in_vain < looks and time.monotonic() - begin < _LONGEST_S:
         in_vain += 1
@@ -174,7 +171,7 @@ def take_rest(
             publishers = taker[0].get_publisher_count()
             published_ns = take_waiting(*taker)
             in_vain = 0 if published_ns else in_vain
-            if (publishers == 1 and published_ns > asked_ns) or not (publishers or published_ns):
+            if (publishers == 1 and published_ns > until_ns) or not (publishers or published_ns):
                 open_topics.remove(taker)
         time.sleep(_LOOK_S if open_topics else 0.0)
     return not open_topics or in_vain >= looks

@@ -139,9 +139,11 @@ def predict_from(
     if bag:
         with Recording(bag) as recording:
             path = recording.scan_path()
-    else:
+    elif len(z):
         SAMPLE_PERIOD.checked(sample_period, name="sample_period")
         positions = POSITION.checked_all(np.asarray(z, np.float64), name="z")
         path = ScanPath(z=positions, sample_period=sample_period)
+    else:
+        raise DataError("no motion is given: name a bag, or give z and its sample_period")
     progress("predicting")
     return predict_error(calibration, path)

@@ -112,6 +112,16 @@ def test_a_refused_calibration_leaves_the_one_in_force(cell, true_calibration):
     )
 
 
+def test_requests_without_their_subject_name_what_is_missing(cell, true_calibration):
+    cell.processes.start("corrector", calibration=saved(cell, "cal.json", true_calibration))
+    loaded = cell.call(LoadCalibration, "corrector/load_calibration", path="")
+    assert (loaded.success, loaded.id) == (False, true_calibration.id)
+    assert loaded.message == "no path is given; name a file of a calibration, CAL.json"
+    predicted = cell.call(PredictError, "corrector/predict_error")
+    assert not predicted.safe
+    assert predicted.message.startswith("no motion is given: name a bag, or give z")
+
+
 def test_an_overridden_calibration_marks_every_cloud_by_its_frame(cell, true_calibration):
     """A viewer that waits for the usual frame shows nothing; one that belongs ends it."""
     path = saved(cell, "cal.json", true_calibration)
