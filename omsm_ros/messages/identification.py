@@ -137,6 +137,8 @@ identification.accuracy: on the intended scan the response alone makes an uncert
     {reached_m:m} (k = 2), where {accuracy_m:m} are asked for: make more steps, or scan more slowly
 identification.requested_order: order {order} was asked for; the free choice leaves more uncertain
     than it can state: its uncertainties are taken {factor:plain/2} times as large
+identification.unusable: a model of order {order} cannot correct ({why}): the motion does not
+    determine all of its poles; ask for fewer, or let the order be chosen
 # Errors.
 identification.few_plateaus: {found!r} plateaus of rest with readings, at least {least} are needed
     for a gain; make more steps or rest longer

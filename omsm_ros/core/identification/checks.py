@@ -11,6 +11,7 @@ import numpy as np
 
 from omsm_ros.core.calibration.certificate import REJECTS, RESERVATION, WARNING, Finding
 from omsm_ros.core.calibration.intended_use import IntendedUse
+from omsm_ros.core.calibration.plausibility import check_covariance, check_dynamics
 from omsm_ros.core.estimation.covariance import gain_uncertainty_alone
 from omsm_ros.core.identification.covariance_terms import ReferenceLag, inter_sample_delay_bound
 from omsm_ros.core.identification.evidence import IdentificationEvidence
@@ -20,6 +21,7 @@ from omsm_ros.core.lti.frequency_response import (
     ResponseLimits,
     low_frequency_delay_uncertainty,
 )
+from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.model_errors.residual_diagnostics import (
     FALSE_ALARM,
     HALVES,
@@ -28,6 +30,7 @@ from omsm_ros.core.model_errors.residual_diagnostics import (
     Contrast,
 )
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.errors import CalibrationError
 
 Findings = Iterator[Finding]
 
@@ -265,6 +268,18 @@ def accuracy(use: IntendedUse, reached: float) -> Findings:
         yield Finding("identification.accuracy", RESERVATION, {"reached_m": 2 * reached}, limits)
 
 
+def usable(
+    dynamics: TransferFunction, covariance: FloatArray, valid_up_to: float, period: float
+) -> Findings:
+    """Reject dynamics that a corrector refuses, such as a pole too slow for any machine."""
+    try:
+        check_dynamics(dynamics, period)
+        check_covariance(covariance, dynamics, valid_up_to)
+    except CalibrationError as err:
+        values = {"order": len(dynamics.denominator) - 1, "why": str(err)}
+        yield Finding("identification.unusable", REJECTS, values)
+
+
 def requested_order(order: int, factor: float) -> Findings:
     """Warn of uncertainties enlarged by ``factor``, see ``inflate_to_free_choice``."""
     if factor > 1:
@@ -312,6 +327,7 @@ CHECKS: tuple[Callable[[IdentificationEvidence], Findings], ...] = (
     lambda e: consistency(e.contrasts),
     lambda e: late_reference(e.reference, e.use.harmless_delay_s),
     # How far the result may be trusted.
+    lambda e: usable(e.dynamics, e.known.covariance, e.known.valid_up_to, e.record.sample_period),
     lambda e: trusted_range(e.known.valid_up_to, e.limits, e.use.least_valid_up_to_hz),
     lambda e: accuracy(e.use, accuracy_on(e) if e.use.accuracy_m else 0.0),
     lambda e: requested_order(e.fit.structure.poles, e.known.widened),

@@ -2,6 +2,7 @@
 
 from itertools import chain
 
+import numpy as np
 import pytest
 
 from omsm_ros.core.calibration.certificate import REJECTS, RESERVATION, WARNING
@@ -16,6 +17,7 @@ from omsm_ros.core.identification.checks import (
     separable_gain,
     trusted_range,
     two_clocks,
+    usable,
 )
 from omsm_ros.core.lti.frequency_response import ResponseLimits
 from omsm_ros.core.lti.transfer_function import TransferFunction
@@ -117,6 +119,17 @@ def test_widened_uncertainties_are_warned_of():
     text = only(requested_order(2, 6.3), WARNING)
     assert "order 2" in text
     assert "6.3 times as large" in text
+
+
+def test_what_a_corrector_refuses_is_rejected():
+    """No record determines a pole that decays for a day, and no filter can have it."""
+    never = TransferFunction.from_ascending([1.0, 1e5], [1.0, 1e5 + 1e-3, 1e2])
+    known = np.zeros((5, 5))
+    assert not list(usable(SLOW, np.zeros((3, 3)), 20.0, 1e-3))
+    text = only(usable(never, known, 20.0, 1e-3), REJECTS)
+    assert "a model of order 2 cannot correct (" in text
+    assert "expected a number from 1e-10 to 1000 s" in text
+    assert "ask for fewer" in text
 
 
 def test_a_finding_carries_the_limit_that_it_exceeds():

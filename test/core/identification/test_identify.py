@@ -7,7 +7,9 @@ import pytest
 from scipy import stats
 from soaked import soaked
 
-from omsm_ros.core.calibration.certificate import Certificate
+from benchmarks.identification import record_once
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import REJECTED, Certificate
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import Chirp, StepTest
 from omsm_ros.core.lti.frequency_response import response_band
@@ -185,3 +187,14 @@ class TestOtherPlants:
         calibration = identify(record_of(recorded(plant=Plant(truth))), order=1).calibration
         assert calibration.certificate.verdict == "rejected"
         assert "misses something" in str(calibration.certificate.reasons[0])
+
+
+@pytest.mark.parametrize("order", [6, *soaked(3, 4, 5, 8, 12)])
+def test_an_accepted_order_can_be_read_back_and_corrected_with(order):
+    """More poles than the motion determines leave one that is too slow for any filter."""
+    calibration = identify(record_once(1, plant=Plant()), order=order).calibration
+    if calibration.certificate.verdict != REJECTED:
+        assert Calibration.from_content(calibration.content()).dynamics == calibration.dynamics
+    elif order == 6:
+        (reason,) = map(str, calibration.certificate.reasons)
+        assert "a model of order 6 cannot correct (slowest decay of G_m is" in reason
