@@ -42,6 +42,7 @@ from omsm_ros.core.adjustment.scan_data import (
     ScanView,
     Zero,
     fitted_surface,
+    play,
     view_of,
     zero_of,
 )
@@ -65,6 +66,8 @@ from omsm_ros.errors import DataError
 
 # Enough for lines and steps to stand out; they are tested after the scales have settled.
 _FIRST_STEPS = 2
+# A backlash is found from the one that was assumed; 5 % of it are 5 % of the shape at a reversal.
+_PLAY_STEPS, _SAME_PLAY = 3, 0.05
 # Points at a time of corrected heights.
 _CHUNK = 16_384
 
@@ -186,8 +189,7 @@ def adjust(
         priors = with_dynamics(priors, calibration)
     zero = zero_of(scans, surface)
     views = [view_of(s, k, zero, surface) for k, s in enumerate(scans)]
-    network, sizes = _network(scans, views, priors)
-    detecting, refutations, doubts = _fitted(network, views, sizes, priors)
+    detecting, refutations, doubts = _with_its_play(scans, views, priors)
     solution = completed(detecting, refutations)
     families = solution.network.families
     effects = effects_on_form(solution, surface, removed)
@@ -213,9 +215,32 @@ def adjust(
         form=form,
         sources=_findings(detecting, effects, priors, refutations),
         refutations=refutations, agreement=agreement, wrong_sign=wrong, verdict=verdict,
-        scales=solution.scales, noise=network.blocks.noise,
+        scales=solution.scales, noise=solution.network.blocks.noise,
         solution=solution, nominal=surface, zero=zero,
     )  # fmt: skip
+
+
+def _with_its_play(
+    scans: Sequence[ScanData], views: Sequence[ScanView], priors: Sequence[Source]
+) -> tuple[Solution, tuple[Refutation, ...], tuple[Doubt, ...]]:
+    """Return the solution with a backlash as wide as it is found, where the scans refute any."""
+    found, assumed = _fitted(*_network(scans, views, priors), views, priors), 0.0
+    for _ in range(_PLAY_STEPS):
+        half = _play_of(found[0], assumed)
+        if not found[1] or half == assumed:
+            break
+        assumed, views = half, [replace(v, motion_play=play(v.motion, half)) for v in views]
+        found = _fitted(*_network(scans, views, priors), views, priors)
+    return found
+
+
+def _play_of(solution: Solution, assumed: float) -> float:
+    """Return half the backlash that is found [m]; ``assumed`` if it is not another one."""
+    family = next(f for f in solution.network.families if f.name == "motion_error")
+    evidence = evidence_of(solution, family)
+    half, unsure = abs(float(evidence.values[0])), 3 * float(evidence.uncertainty[0])
+    another = abs(half - assumed) > max(unsure, _SAME_PLAY * half) and half > unsure
+    return half if another else assumed
 
 
 def _walk(solution: Solution, priors: Sequence[Source]) -> tuple[float, float, float | None]:
@@ -240,7 +265,7 @@ def _network(
 
 
 def _fitted(
-    network: Network, views: Sequence[ScanView], sizes: Mapping[str, float],
+    network: Network, sizes: Mapping[str, float], views: Sequence[ScanView],
     priors: Sequence[Source],
 ) -> tuple[Solution, tuple[Refutation, ...], tuple[Doubt, ...]]:  # fmt: skip
     """Return the solution, lines and steps of the residuals among its families."""
@@ -276,8 +301,8 @@ def _or_sense_of_c(
     mirrored = [replace(s, y=-s.y, c=-s.c) for s in scans]
     zero = zero_of(mirrored, surface)
     views = [view_of(s, k, zero, surface) for k, s in enumerate(mirrored)]
-    network, sizes = _network(mirrored, views, priors)
-    agrees = all(r.minor for r in _fitted(network, views, sizes, priors)[1])
+    fitted = _fitted(*_network(mirrored, views, priors), views, priors)
+    agrees = all(r.minor for r in fitted[1])
     return (Reason(WRONG_SENSE),) if agrees else reasons
 
 

@@ -149,8 +149,11 @@ def _dynamic(r: Ranges) -> list[Family]:
         _one("lag_change", "s", lambda v: v.motion_rate, 3e-4, OTHER_SPEED, 1e-4),
         _one("probe_latency", "s", lambda v: v.lateral_error(v.x_rate, v.y_rate), 3e-4,
              OTHER_STAND_OFF),
+        # Readings that come later than in the step test: by place and by Z, which nearly cancel.
+        _one("latency_change", "s", lambda v: v.motion_rate + v.lateral_error(v.x_rate, v.y_rate),
+             3e-4, OTHER_SPEED),
         _one("lag_asymmetry", "s", lambda v: np.abs(v.motion_rate), 1e-4, OTHER_SPEED),
-        _one("motion_error", "m", lambda v: np.sign(v.motion_rate), 1e-7, OTHER_DIRECTION),
+        _one("motion_error", "m", lambda v: v.motion_play, 1e-7, OTHER_DIRECTION),
         _one("lag_motion", "s", lambda v: v.motion_rate * (v.motion - middle) / r.motion, 1e-4,
              OTHER_SPEED),
         _one("lag_x", "s", lambda v: v.motion_rate * (v.slide_x / far - 0.5), 1e-4, OTHER_SPEED),
@@ -351,6 +354,8 @@ _SHIFT_AGAIN_M, _CLOCKING_AGAIN_RAD = 3e-5, 1e-3
 _RATE_M_S = 1e-9
 # Free: every scan shows its tilt against the others.
 _TILT_RAD = 1e-4
+# Two, three and four jaws.
+_CLAMPED = tuple(t for t in terms_up_to(4, 2) if t.n == abs(t.m))
 # Terms of the form that a scan may show differently from the others.
 DIFFERENT_TERMS = terms_up_to(4, 2)
 
@@ -364,8 +369,13 @@ def _of_each_scan(r: Ranges) -> list[Family]:
     """
     found = [
         _drift(r),
-        _turning(r),
-        _tilting_away(r),
+        # A part that creeps about the axis, or counts of C that are lost one by one.
+        Family("c_drift", "rad", len(r.clampings), _of_each(r, lambda v: (
+            v.lateral_error(-v.y, v.x) * v.since / r.durations[v.index])[np.newaxis]),
+            5e-5, REPEATED_TRACK),
+        _fading("tilt_drift", "rad", r, lambda v: np.stack([v.x, v.y]), 2, 1e-6),
+        _fading("part_settling", "m", r, lambda v: zernike_values(
+            v.x / r.radius, v.y / r.radius, _CLAMPED), len(_CLAMPED), 1e-7),
         _one("drift_rate", "m/s", lambda v: v.time, 1e-8, REPEATED_TRACK, _RATE_M_S),
         Family("decentre", "m", 2, lambda v: np.stack(
             [v.lateral_error(1.0, 0.0), v.lateral_error(0.0, 1.0)]), 3e-5, REFERENCE, named=False),
@@ -386,6 +396,8 @@ def _of_each_scan(r: Ranges) -> list[Family]:
                          1e-3, turn),
                 _of_scan(k, "expansion", "1", 1, lambda v: v.lateral_error(v.x, v.y)[np.newaxis],
                          3e-5),
+                _of_scan(k, "centre_moved", "m", 2, lambda v: np.stack(
+                    [v.across(1.0, 0.0), v.across(0.0, 1.0)]), 2e-5),
             ]  # fmt: skip
         if len(r.clampings) > 1:
             found.append(_different(k, r.radius))
@@ -415,34 +427,28 @@ def _drift(r: Ranges) -> Family:
     own = len(_FADING) + 1
 
     def columns(v: ScanView) -> FloatArray:
-        made = np.zeros((own * len(r.clampings), len(v)))
-        here = made[own * v.index : own * (v.index + 1)]
-        here[:-1], here[-1] = np.exp(-v.since / times), v.since / r.duration
-        return made
+        return np.concatenate([np.exp(-v.since / times), [v.since / r.duration]])
 
-    return Family("drift", "m", own * len(r.clampings), columns, 1e-7, REPEATED_TRACK)
+    return Family("drift", "m", own * len(r.clampings), _of_each(r, columns), 1e-7, REPEATED_TRACK)
 
 
-def _turning(r: Ranges) -> Family:
-    """Return a part that creeps about the axis, or counts of C that are lost one by one."""
-
-    def columns(v: ScanView) -> FloatArray:
-        made = np.zeros((len(r.durations), len(v)))
-        made[v.index] = v.lateral_error(-v.y, v.x) * v.since / r.durations[v.index]
-        return made
-
-    return Family("c_drift", "rad", len(r.durations), columns, 5e-5, REPEATED_TRACK)
+def _of_each(r: Ranges, columns: Columns) -> Columns:
+    """Return ``columns`` for each scan of its own."""
+    mine = np.eye(len(r.clampings))
+    return lambda v: np.asarray(np.kron(mine[:, [v.index]], columns(v)), np.float64)
 
 
-def _tilting_away(r: Ranges) -> Family:
-    """Return a part that tilts in its clamping: fading, and steadily."""
-    times = r.duration * np.array(_FADING)
+def _fading(name: str, unit: str, r: Ranges, shapes: Columns, number: int, wide: float) -> Family:
+    """Return ``number`` shapes of a part that gives way in its clamping, and is at rest later.
+
+    The form is that of the part at rest, so that the slowest course leaves it uncertain.
+    """
+    times = r.duration * np.array([*_FADING, 1.0])
 
     def columns(v: ScanView) -> FloatArray:
-        courses = [*(np.exp(-v.time / time) for time in times), v.time / r.duration - 0.5]
-        return np.stack([course * place for course in courses for place in (v.x, v.y)])
+        return np.concatenate([np.exp(-v.time / time) * shapes(v) for time in times])
 
-    return Family("tilt_drift", "rad", 2 * len(times) + 2, columns, 1e-6, REPEATED_TRACK)
+    return Family(name, unit, number * len(times), columns, wide, REPEATED_TRACK)
 
 
 DIFFERS = "scan_differs"

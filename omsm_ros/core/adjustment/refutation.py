@@ -35,6 +35,8 @@ _UNCHANGED = 0.3
 # A lag that depends on something has an unknown mean, which is no further cause.
 _OFFSET = "lag_change"
 _MOST_RELEASED = 8
+# Further culprits that are tried first.
+_MOST_TRIED = 3
 # Before the scans: of ten errors that nobody declared, a machine has one.
 ODDS_ABSENT, SURE = 9.0, 50.0
 # Starting values; each step moves a variance by 30 at most, and four are enough for 2 %.
@@ -110,16 +112,35 @@ def settled(solution: Solution, steps: int) -> Solution:
 def fit_and_refute(
     network: Network, y: FloatArray, scales: Scales, sizes: Mapping[str, float]
 ) -> tuple[Solution, tuple[Refutation, ...], tuple[Doubt, ...]]:
-    """Return the solution with all refuted families released, which they are, and what is open."""
+    """Return the solution with all refuted families released, which they are, and what is open.
+
+    Where the simplest culprit does not explain all, the next that explains as much is tried.
+    """
     solution = settled(solve(network, y, scales, sizes), _FIRST_STEPS)
     evidences = [evidence_of(solution, f) for f in network.families]
+    found = made = _released(solution, evidences, ())
+    avoided: list[str] = []
+    while not all(c.explains for c in made[1]) and len(avoided) < _MOST_TRIED:
+        avoided.append(made[1][0].name)
+        next_one = _culprit(_beyond(evidences, (), _LEAST_GAIN), avoided)
+        if next_one.family.name in avoided or not _plausible(next_one):
+            break
+        made = _released(solution, evidences, avoided)
+    return made if all(c.explains for c in made[1]) else found
+
+
+def _released(
+    solution: Solution, evidences: list[Evidence], avoided: Sequence[str]
+) -> tuple[Solution, tuple[Refutation, ...], tuple[Doubt, ...]]:
+    """Return what :func:`fit_and_refute` does, with a first culprit that is none of ``avoided``."""
+    network, y = solution.network, solution.y
     first = {e.family.name: e.values for e in evidences}
     found: list[Refutation] = []
     released: list[str] = []
     steps = [solution]
     least = _LEAST_GAIN
     while len(found) < _MOST_RELEASED and (beyond := _beyond(evidences, released, least)):
-        best = _culprit(beyond)
+        best = _culprit(beyond, () if released else avoided)
         least = max(least, MODEL_SHARE * best.gain)
         family = best.family
         # As large as it was found, if that is more than plausible.
@@ -225,10 +246,10 @@ def _as_good(one: Evidence, best: Evidence) -> bool:
     return one.gain >= best.gain - max(_ALIKE, _ALIKE_SHARE * best.gain)
 
 
-def _culprit(beyond: list[Evidence]) -> Evidence:
+def _culprit(beyond: list[Evidence], avoided: Sequence[str]) -> Evidence:
     """Return the simplest of those that explain as much; a named one before one that detects."""
     as_good = [e for e in beyond if _as_good(e, beyond[0])]
-    named = [e for e in as_good if _plausible(e)] or as_good
+    named = [e for e in as_good if _plausible(e) and e.family.name not in avoided] or as_good
     return min((e for e in named if e.gain >= named[0].gain - _ALIKE), key=lambda e: e.family.size)
 
 

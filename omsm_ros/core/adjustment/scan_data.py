@@ -113,6 +113,7 @@ class ScanView:
     turned: spindle angle plus clocking, from the machine frame to the part frame [rad]
     x_rate, y_rate: of the path over the part [m/s];  slope_x, slope_y: of the surface, part frame
     motion, motion_rate, motion_acceleration: of Z [m], [m/s], [m/s²]
+    motion_play: 1 upwards, −1 downwards, or by an assumed backlash: see :func:`play`
     motion_fading: mean of the motion over the last seconds less the motion: creep [m]
     distance: that the probe would measure of a part without form error [m]
     deviation: height less nominal height [m]
@@ -134,6 +135,7 @@ class ScanView:
     motion: FloatArray
     motion_rate: FloatArray
     motion_acceleration: FloatArray
+    motion_play: FloatArray
     motion_fading: FloatArray
     distance: FloatArray
     removed: FloatArray
@@ -192,6 +194,7 @@ def view_of(scan: ScanData, index: int, zero: Zero, nominal: Surface) -> ScanVie
     slope_x, slope_y = slopes_by_differences(nominal, x, y)
     deviation = scan.height - zero.height - nominal.height(x, y)
     # Creep: the mean of the motion over the last seconds, fading, less the motion.
+    motion_rate = _rate(scan.time, scan.motion)
     step = float(np.median(np.diff(scan.time))) / _CREEP_S
     start = [scan.motion[0] * (1 - step)]
     followed, _ = scipy.signal.lfilter([step], [1, step - 1], scan.motion, zi=start)
@@ -209,7 +212,8 @@ def view_of(scan: ScanData, index: int, zero: Zero, nominal: Surface) -> ScanVie
         slope_x=slope_x,
         slope_y=slope_y,
         motion=scan.motion - zero.motion,
-        motion_rate=_rate(scan.time, scan.motion),
+        motion_rate=motion_rate,
+        motion_play=np.sign(motion_rate),
         motion_acceleration=_of_neighbours(scan, _rate(scan.time, scan.motion, 2)),
         motion_fading=followed - scan.motion,
         # The measured distance holds the form itself, as a regressor it would take it away.
@@ -219,6 +223,18 @@ def view_of(scan: ScanData, index: int, zero: Zero, nominal: Surface) -> ScanVie
         speed=scan.speed,
         index=index,
     )
+
+
+def play(motion: FloatArray, half: float) -> FloatArray:
+    """Return ``motion`` (n,) less what follows it with a backlash of 2 ``half`` [m], over ``half``.
+
+    It is 1 upwards and −1 downwards once the backlash is passed, and begins in its middle.
+    """
+    follower, made = float(motion[0]), []
+    for place in motion.tolist():
+        follower = min(max(follower, place - half), place + half)
+        made.append(follower)
+    return np.asarray((motion - made) / half)
 
 
 def delayed(scan: ScanData, latency: float) -> ScanData:

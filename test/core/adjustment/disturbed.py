@@ -23,6 +23,8 @@ KINDS = {
     "centre_x": {"centre_x": 3e-6},
     "asymmetry": {"asymmetry": 20e-6},
     "backlash": {"backlash": 30e-9},
+    "play": {"play": 40e-9},
+    "clamp": {"clamp": 150e-9},
     "spindle_3": {"more_spindle": ((3, 60e-9, 0.0),)},
     "spindle_6": {"more_spindle": ((6, 20e-9, 0.0),)},
     "spindle_2.5": {"more_spindle": ((2.5, 20e-9, 0.0),)},

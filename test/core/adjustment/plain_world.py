@@ -56,6 +56,16 @@ def _fading(z, samples):
     return signal.lfilter([step], [1, step - 1], z, zi=[z[0] * (1 - step)])[0] - z
 
 
+def _played(z, half):
+    """Return what a rod does in a sleeve that is ``half`` wider on either side, and moves by z."""
+    rod = np.empty(len(z))
+    rod[0] = z[0]
+    for k in range(1, len(z)):
+        gap = rod[k - 1] - z[k]
+        rod[k] = z[k] + np.sign(gap) * half if abs(gap) > half else rod[k - 1]
+    return rod
+
+
 def _height_rate(place, step=1e-4):
     """Return the rate of the mirror's height [m/s] at ``place``, a function of time [s]."""
     return (MIRROR.height(*place(step)) - MIRROR.height(*place(-step))) / (2 * step)
@@ -117,6 +127,8 @@ class Machine:
         seen = (at.real, at.imag)
         z_rate = _height_rate(lambda dt: place(c + omega * dt, r + r_rate * dt))
         true = MIRROR.height(*seen) + self.part(*seen)
+        held = np.exp(-(self.begin + t) / 150.0) * (seen[0] ** 2 - seen[1] ** 2) / RADIUS_M**2
+        true = true + wrong.get("clamp", 0.0) * held
         stand_off = wrong.get("stand_off", 0.0)
         z = z - stand_off * np.sin(2 * np.pi * t / 7.0)
         z_rate = z_rate - stand_off * (2 * np.pi / 7.0) * np.cos(2 * np.pi * t / 7.0)
@@ -153,6 +165,8 @@ class Machine:
         made = made + wrong.get("creep", 0.0) * _fading(z, 2.0 * self.rate)
         made = made + wrong.get("stretch", 0.0) * z
         made = made + wrong.get("backlash", 0.0) * np.sign(z_rate)
+        if "play" in wrong:
+            made = made + z - _played(z, wrong["play"])
         made = made + wrong.get("settling", 0.0) * np.exp(-t / 15.0)
         made = made + wrong.get("height_step", 0.0) * (t > 0.4 * duration)
         made = made + wrong.get("hum", 0.0) * np.sin(2 * np.pi * 50.0 * t + 1.0)

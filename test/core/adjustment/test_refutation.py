@@ -1,6 +1,7 @@
 """Wrong declarations are named by what the scans show, with the size that the machine has."""
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -95,6 +96,55 @@ def test_two_scans_refute_and_correct(kind, family, true):
     alike = {n for r in found.refutations for n in r.alike}
     most = 150e-9 if "spindle_tilt/2" in alike else IN_PART_FORM_M.get(kind, 6e-9)
     assert found.form.mean_uncertainty < most
+
+
+def off_and_stated(machine, found):
+    """Largest error of a term over its standard uncertainty, and of the form over U."""
+    *_, terms, error = normalised(machine, found)
+    return np.max(np.abs(terms)), error / (2 * found.form.mean_uncertainty)
+
+
+@pytest.mark.parametrize("half", [40e-9, *soaked(15e-9, 120e-9)])
+def test_a_backlash_is_found_with_its_width(half):
+    """At each reversal, and near the centre, the probe stands still until the gap is passed."""
+    machine, made = drawn(0, 2, play=half)
+    found = adjust(made, AS_DRAWN, nominal=MIRROR, accuracy=25e-9)
+    assert [r.name for r in found.refutations] == ["motion_error"]
+    assert abs(found.source("motion_error").found[0]) == pytest.approx(half, rel=0.05)
+    term, form = off_and_stated(machine, found)
+    assert term < 3.5
+    assert form < 1
+
+
+def test_a_clamp_that_relaxes_is_named_and_leaves_the_form_uncertain():
+    machine, found = disturbed("clamp", 2)
+    assert found.refutations[0].name == "part_settling"
+    term, form = off_and_stated(machine, found)
+    assert term < 3.5
+    assert form < 1.5
+
+
+def test_a_spindle_centre_that_moved_between_scans_is_named():
+    machine, made = drawn(0, 1)
+    second = machine.scan(60.0, outward=True, centre_x=2e-6, centre_y=-4e-6)
+    found = adjust([*made, second], AS_DRAWN, nominal=MIRROR, accuracy=25e-9)
+    cause = found.refutations[0]
+    assert "centre_moved@1" in (cause.name, *cause.alike)
+    moved = found.source("centre_moved@1")
+    assert np.all(np.abs(moved.found - [-2e-6, 4e-6]) < 4 * moved.uncertainty)
+    term, form = off_and_stated(machine, found)
+    assert term < 3.5
+    assert form < 1
+
+
+@pytest.mark.soak
+def test_readings_later_than_in_the_step_test_are_named():
+    """Where Z follows the part late, 0.2 ms of latency act by its acceleration."""
+    _, made = drawn(0, 2)
+    late = [replace(s, height=s.height - 2e-4 * np.gradient(s.distance, s.time)) for s in made]
+    found = adjust(late, AS_DRAWN, nominal=MIRROR, accuracy=25e-9)
+    cause = found.refutations[0]
+    assert {"latency_change", "lag_curvature"} & {cause.name, *cause.alike}
 
 
 def test_what_two_causes_explain_is_in_the_uncertainty():
