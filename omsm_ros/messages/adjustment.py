@@ -7,6 +7,8 @@ adjustment.one_scan: {scans} scan, expected two or more of one part, at differen
     opposite directions
 adjustment.no_common_ring: the scans share no ring: one begins at a radius of {inner!r} m, another
     ends at {outer!r} m; scan the same part of the surface
+adjustment.no_spiral: scan {scan} is no spiral over the part: {turns:plain/3} turns, radii over
+    {width:m}; let C turn three times or more while X moves over the part
 adjustment.remounted_part: a part that was mounted again is turned by an unknown angle, which has
     the effect of a lag; scan it at both speeds without removing it, or state its {opt.clocking}
 adjustment.equal_speeds: the scans all run at {speeds:list} rpm, so that a lag is the same in each

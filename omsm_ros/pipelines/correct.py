@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.adjustment.scan_data import ScanData
+from omsm_ros.core.adjustment.scan_data import SPOT_M, ScanData
 from omsm_ros.core.calibration.applicability import admit, objections
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
@@ -41,7 +41,6 @@ from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.recording import MAX_PATH_SAMPLES, SCAN_TOPICS, Recording, scan_data
 from omsm_ros.quantities import TIME_LAPSE
 from omsm_ros.readable import counts_text, quantity
-from omsm_ros.units import MICROMETRE_M
 
 # Samples by which one stream may be recorded ahead of the other: a quarter of a gigabyte.
 MAX_PENDING_SAMPLES = 4_000_000
@@ -209,8 +208,6 @@ LATERAL_SOURCES = (
 )
 
 
-# Extent of points that are no scan: the spot of a probe, and the jitter of axes that do not move.
-_SPOT_M = 10 * MICROMETRE_M
 # A quarter of an hour at 1 kHz, whose adjustment needs 1 GB; longer scans are not adjusted.
 _MOST_ADJUSTED = 1_000_000
 
@@ -375,9 +372,9 @@ class _RunningResults:
     def _on_one_spot(self) -> Iterator[str]:
         """Yield a fault if all points lie on one spot, as those of a step test."""
         rows = self.drawn.rows()
-        if len(rows) and max(np.ptp(rows["x"]), np.ptp(rows["y"])) < _SPOT_M:
+        if len(rows) and max(np.ptp(rows["x"]), np.ptp(rows["y"])) < SPOT_M:
             yield (
-                f"all points lie within {quantity(_SPOT_M, 'm')}: X and C did not scan a surface; "
+                f"all points lie within {quantity(SPOT_M, 'm')}: X and C did not scan a surface; "
                 "evaluate a step test with 'omsm identify', and test a calibration on one with "
                 "'omsm verify'"
             )

@@ -113,8 +113,6 @@ class Judgement:
         return budget.entry()
 
 
-# Turns without which a scan determines neither form nor drift.
-_LEAST_TURNS = 3.0
 # Beyond this a pose is not linear, and the surface is moved before the scan is adjusted.
 _SMALL_ANGLE_RAD, _SMALL_SHIFT_M = 1e-4, 1e-5
 
@@ -147,7 +145,7 @@ def add_verdict(
         doubts += map(str, mismatch(x, y, done.points["height"], surface))
     doubts += done.faults
     doubts += map(str, _losses(done))
-    if scan is None or scan.turns < _LEAST_TURNS:
+    if scan is None or not scan.is_spiral:
         systematic = summary["budget"]["systematic"]
         verdict = untested_verdict(2 * systematic, judgement.accuracy, calibration)
         if form is not None:

@@ -178,12 +178,16 @@ def adjust(
     Raises
     ------
     DataError
-        For no scan.
+        For no scan, and for a scan that is no spiral.
     ConfigurationError
         For a declared source that is no family of the adjustment.
     """
     if not scans:
         raise DataError("no scan to adjust; give one or more scans of one part")
+    for number, scan in enumerate(scans, 1):
+        if not scan.is_spiral:
+            width = float(np.ptp(np.hypot(scan.x, scan.y)))
+            raise DataError("adjustment.no_spiral", scan=number, turns=scan.turns, width=width)
     surface: Surface = fitted_surface(scans[0]) if nominal is None else nominal
     if calibration is not None:
         priors = with_dynamics(priors, calibration)

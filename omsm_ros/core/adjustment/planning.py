@@ -23,7 +23,7 @@ from omsm_ros.core.adjustment.figures import POSE, form_map
 from omsm_ros.core.adjustment.network import Network, Scales, solve
 from omsm_ros.core.adjustment.part_terms import part_model
 from omsm_ros.core.adjustment.refutation import completed
-from omsm_ros.core.adjustment.scan_data import ScanData, view_of, zero_of
+from omsm_ros.core.adjustment.scan_data import LEAST_POINTS, ScanData, view_of, zero_of
 from omsm_ros.core.adjustment.sources import Source, prior_sizes
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
@@ -222,7 +222,7 @@ def design_scan(design: ScanDesign, nominal: Surface, begin: float, shown: float
 
     begin: when it begins [s];  shown: turns that stand for those of the design, at its speed
     """
-    number = round(shown * _POINTS_A_TURN)
+    number = max(round(shown * _POINTS_A_TURN), 2 * LEAST_POINTS)  # some may be off the part
     share = np.arange(number) / number
     time = share * shown * 60 / abs(design.rpm)
     slide = design.start + (design.end - design.start) * share

@@ -25,6 +25,10 @@ from omsm_ros.errors import DataError
 
 # A turn at 30 rpm holds 2000 points at 1 kHz; two hundred determine neither form nor drift.
 LEAST_POINTS = 200
+# Extent of points that are no scan: the spot of a probe, and the jitter of axes that do not move.
+SPOT_M = 10e-6
+# Turns without which a scan determines neither form nor drift.
+_LEAST_TURNS = 3.0
 # At the 12th harmonic of a turn a second the rate is 1 % short.
 _HALF_WINDOW_S, _POLYNOMIAL = 12e-3, 4
 # Creep of guides and mounts that a step test with plateaus of half a second does not show.
@@ -89,6 +93,12 @@ class ScanData:
     def turns(self) -> float:
         """Turns of the spindle, without sign."""
         return float(abs(self.c[-1] - self.c[0]) / (2 * np.pi))
+
+    @property
+    def is_spiral(self) -> bool:
+        """True if it has turns enough, over a range of radii, to determine form and drift."""
+        radius = np.hypot(self.x, self.y)
+        return self.turns >= _LEAST_TURNS and float(np.ptp(radius)) > SPOT_M
 
     @property
     def speed(self) -> float:

@@ -52,6 +52,17 @@ def test_a_second_speed_takes_away_what_one_scan_cannot(table):
         assert error < 2 * adjustment.form.mean_uncertainty
 
 
+def test_a_circle_is_no_spiral(table):
+    """C turns and X does not move: neither form nor a scan to add follows from it."""
+    _, (scan, *_), _ = table
+    assert scan.is_spiral
+    circle = replace(scan, x=RADIUS_M * np.cos(scan.c), y=-RADIUS_M * np.sin(scan.c))
+    assert not circle.is_spiral
+    with pytest.raises(DataError, match="scan 2 is no spiral") as told:
+        adjust([scan, circle], PRIORS, nominal=MIRROR)
+    assert told.value.code == "adjustment.no_spiral"
+
+
 def test_the_lag_is_found_to_a_fifth_of_a_microsecond(table):
     """A tenth of it is how little is declared of a lag that differs with the speed."""
     _, _, (one, two, _) = table

@@ -55,6 +55,16 @@ def test_the_shortest_set_that_reaches_the_accuracy_is_first():
     assert forms == sorted(forms)
 
 
+@pytest.mark.parametrize("width", [1e-3, 20e-6])
+def test_few_turns_far_from_the_axis_have_additions(width):
+    """A scan beyond the centre at its feed has hundreds of turns; the few still have points."""
+    first = ScanDesign(rpm=30.0, start=RADIUS_M, end=RADIUS_M - width, pitch=width / 4)
+    sets = [[first, added] for added in additions(first).values()]
+    forms = [posterior_uncertainty(designs, PRIORS, MIRROR).form for designs in sets]
+    assert np.all(np.isfinite(forms))
+    assert min(forms) > 0
+
+
 def test_a_repeated_track_does_not_show_a_lag():
     first, more = FIRST, additions(FIRST)
     again = posterior_uncertainty([first, more["repeated_track"]], PRIORS, MIRROR)
