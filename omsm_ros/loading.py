@@ -6,6 +6,7 @@ nothing that takes time, because signals are not handled before.
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -14,11 +15,20 @@ STDERR = 2
 # Number of BLAS threads. With several, long sums depend on their number, and on a busy computer
 # they wait for each other for ten times as long as they compute.
 _THREADS = "OMP_NUM_THREADS"
+_PR_SET_PDEATHSIG = 1  # of <linux/prctl.h>
 
 
 def one_thread_of_blas() -> None:
     """Limit BLAS to one thread, unless the user has set their number; call before it is loaded."""
     os.environ.setdefault(_THREADS, "1")
+
+
+def signal_when_parent_ends(number: signal.Signals) -> None:
+    """Let Linux send ``number`` to this process when the one that started it ends, even killed."""
+    if sys.platform == "linux":
+        import ctypes
+
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
 
 
 @contextmanager

@@ -8,6 +8,7 @@ import faulthandler
 import importlib
 import math
 import multiprocessing
+import os
 import resource
 import signal
 import time
@@ -20,6 +21,7 @@ from typing import Any, TypeAlias, TypeVar, cast
 
 from omsm_ros.errors import FileError, OmsmError
 from omsm_ros.io.files import library_errors
+from omsm_ros.loading import signal_when_parent_ends
 from omsm_ros.quantities import MAP_POINTS, shown
 
 T = TypeVar("T")
@@ -71,7 +73,7 @@ def in_child(
     """
     context: Any = multiprocessing.get_context(method)
     receiver, sender = context.Pipe(duplex=False)
-    arguments = (sender, work, most_bytes, attend is not None)
+    arguments = (os.getpid(), sender, work, most_bytes, attend is not None)
     child = context.Process(target=_child, args=arguments, daemon=True)
     with warnings.catch_warnings():
         # Python 3.12 warns of threads; a fork does not wait for any of them.
@@ -102,8 +104,13 @@ def in_child(
     return content  # type: ignore[no-any-return]
 
 
-def _child(sender: Connection, work: Callable[..., Any], most_bytes: int, tells: bool) -> None:
+def _child(
+    caller: int, sender: Connection, work: Callable[..., Any], most_bytes: int, tells: bool
+) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the caller ends this process
+    signal_when_parent_ends(signal.SIGKILL)  # a killed caller cannot
+    if os.getppid() != caller:
+        return
     faulthandler.disable()  # and reports a crash in one line
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (most_bytes, most_bytes))

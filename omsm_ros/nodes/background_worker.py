@@ -148,7 +148,8 @@ class BackgroundWorker:
         try:
             done.set_result(work())
         except Exception as err:  # raised by ``do``
-            done.set_exception(err)
+            if not done.done():  # a goal cancelled meanwhile has its answer
+                done.set_exception(err)
         # Without waking it, the executor continues the waiting service only at its next event.
         if (executor := self._node.executor) is not None:
             executor.wake()

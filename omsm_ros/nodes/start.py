@@ -4,7 +4,6 @@ The module has no slow imports, so that Ctrl-C while the others load is an order
 ``python -m omsm_ros.nodes.start corrector …`` is the same as the command ``corrector``.
 """
 
-import ctypes
 import importlib
 import os
 import signal
@@ -12,7 +11,11 @@ import sys
 from pathlib import Path
 
 from omsm_ros.errors import FEWEST_OPEN_FILES, MORE_FILES, open_files
-from omsm_ros.loading import exit_on_signal_while_loading, one_thread_of_blas
+from omsm_ros.loading import (
+    exit_on_signal_while_loading,
+    one_thread_of_blas,
+    signal_when_parent_ends,
+)
 from omsm_ros.nodes.memory import use_single_malloc_arena
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -30,7 +33,6 @@ _TRANSPORTS_CHOSEN = (*_PROFILES, "FASTDDS_BUILTIN_TRANSPORTS")
 _MORE_FROM_PROFILE = "RMW_FASTRTPS_USE_QOS_FROM_XML"  # also memory and publication mode
 _PUBLICATION_MODE = "RMW_FASTRTPS_PUBLICATION_MODE"
 _BAD_INPUT = 2
-_PR_SET_PDEATHSIG = 1  # of <linux/prctl.h>
 _OF_ITS_OWN = ("corrector", "calibrator", "vibration_monitor", "recorder", "player", "viewer",
                "cell_emulator", "cell_demo")  # fmt: skip
 _DRIVERS = ("confocal_driver", "axis_driver", "reference_driver", "accelerometer_driver")
@@ -98,7 +100,7 @@ def end_with_launch() -> None:
         return
     child = launch == str(os.getppid())  # not of a prefix, such as a terminal or debugger
     if child:
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        signal_when_parent_ends(signal.SIGTERM)
     if (child and launch != str(os.getppid())) or not os.path.exists(f"/proc/{launch}"):
         sys.exit(f"the launch that started this node ({launch}) has ended")
 

@@ -2,6 +2,9 @@
 
 import os
 import platform
+import signal
+import subprocess
+import sys
 import time
 import weakref
 from contextlib import ExitStack
@@ -81,3 +84,41 @@ def test_work_on_a_bag_from_outside_has_a_process_with_limits():
     with pytest.raises(OmsmError, match=r"in 0\.5 s"):
         in_child(partial(time.sleep, 60.0), seconds=0.5)
     assert time.monotonic() - began < 20.0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux ends a process with its parent")
+@pytest.mark.parametrize("method", ["spawn", "fork"])
+def test_the_process_of_a_killed_caller_ends(tmp_path, method):
+    script = tmp_path / "caller.py"
+    script.write_text(
+        "import functools, os, pathlib, time\n"
+        "from omsm_ros.io.child_process import in_child\n"
+        "def work(file):\n"
+        "    part = file.with_suffix('.part')\n"
+        "    part.write_text(str(os.getpid()))\n"
+        "    part.rename(file)\n"
+        "    time.sleep(600)\n"
+        "if __name__ == '__main__':\n"
+        f"    file = pathlib.Path({str(tmp_path / 'pid')!r})\n"
+        f"    in_child(functools.partial(work, file), method={method!r})\n"
+    )
+    caller = subprocess.Popen([sys.executable, str(script)])
+    try:
+        assert soon((tmp_path / "pid").exists)
+        child = int((tmp_path / "pid").read_text())
+    finally:
+        caller.kill()
+        caller.wait()
+    try:
+        assert soon(lambda: not runs(child))
+    finally:
+        if runs(child):
+            os.kill(child, signal.SIGKILL)
+
+
+def runs(pid):
+    """Whether a process is there and is not only waited for."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
