@@ -9,7 +9,7 @@ from __future__ import annotations
 from binascii import crc32
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from functools import lru_cache
 from itertools import accumulate
 from operator import itemgetter
@@ -30,7 +30,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from omsm_ros.errors import BagError
-from omsm_ros.io.files import exception_text, open_regular
+from omsm_ros.io.files import library_errors, open_regular
 from omsm_ros.io.json_and_yaml import has_aliases
 from omsm_ros.quantities import shown
 
@@ -55,18 +55,9 @@ _MOST_PACKED, _ALWAYS_UNPACKED_BYTES = 100, 16 * 1024**2
 DAMAGED = "it is damaged; save what is whole with 'omsm inspect --repair', or record it again"
 
 
-@contextmanager
-def bag_errors(path: Path, remedy: str) -> Iterator[None]:
+def bag_errors(path: Path, remedy: str) -> AbstractContextManager[None]:
     """Raise BagError for any of the many exceptions that the libraries raise on a bag's bytes."""
-    try:
-        yield
-    except BagError:
-        raise
-    except Exception as err:
-        raise BagError(
-            f"bag {str(path)!r} cannot be read: {type(err).__name__}: {exception_text(err)}; "
-            f"{remedy}"
-        ) from err
+    return library_errors(f"bag {str(path)!r}", remedy, BagError)
 
 
 _ROS_1_MAGIC = b"#ROSBAG V"

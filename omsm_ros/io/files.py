@@ -70,14 +70,14 @@ def load_object(
 
 
 @contextmanager
-def library_errors(what: str, remedy: str) -> Iterator[None]:
-    """Raise FileError for any of the many exceptions that libraries raise on a damaged file."""
+def library_errors(what: str, remedy: str, error: type[FileError] = FileError) -> Iterator[None]:
+    """Raise ``error`` for any of the many exceptions that libraries raise on a damaged file."""
     try:
         yield
-    except FileError:
+    except error:
         raise
     except Exception as err:
-        raise FileError(f"{what} cannot be read: {exception_text(err)}; {remedy}") from err
+        raise error(f"{what} cannot be read: {exception_text(err)}; {remedy}") from err
 
 
 def open_regular(path: Path | str, error: type[FileError], what: str) -> IO[bytes]:

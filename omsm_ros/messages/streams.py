@@ -59,7 +59,7 @@ streams.steps_z: Z moves in steps of {step:m}, a height error of {error:m} (rms)
     trigger and with all digits, or state encoder_resolution
 # Records of motion
 streams.no_blocks: {axes} axis blocks and {distance} distance blocks: both are needed; check that
-    both topics were recorded
+    both topics are published, or were recorded
 streams.record_lengths: record: channels of different lengths {lengths!r}
 streams.record_span: the recording spans {samples!r} samples in {sessions!r} runs of the trigger
     counter, expected one of at most {most}: two recordings in one, a counter that was reset, or a

@@ -217,7 +217,9 @@ class CalibratorNode(ManagedNode):
         attend = goal.attend if goal is not None else None
         duration = quantities.DURATION.checked(request.duration)
         order = quantities.ORDER.checked(request.order)
-        options = {"order": order, "input": request.input or "encoder"}
+        if (source := request.input or "encoder") not in ("encoder", "reference"):
+            raise ConfigurationError("estimation.unknown_input", input=source)
+        options = {"order": order, "input": source}
         if bag:
             lapse = self._time_lapse
             work = partial(_identify_bag, bag, duration, self._settings, lapse, self._trigger)

@@ -77,6 +77,8 @@ class CellEmulatorNode(ManagedNode):
     ends it. The action ``~/scan`` ends with the motion, and stops it when it is cancelled.
     """
 
+    closes_last = True  # or a driver would report that it lost its port
+
     def __init__(self) -> None:
         super().__init__("cell_emulator", PARAMETERS)
         self._link = ""

@@ -190,7 +190,10 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     values: its parameters, once it is configured
     fatal: an error that ends the node, with exit code 2
+    closes_last: of the nodes of a process, since the others use what it offers
     """
+
+    closes_last = False
 
     def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
         try:

@@ -71,7 +71,7 @@ def run(*make_nodes: Callable[[], ManagedNode]) -> None:
     try:
         _spin(nodes, ending)
     finally:
-        for each in nodes:
+        for each in sorted(nodes, key=lambda node: node.closes_last):
             each.close()
             each.destroy_node()
         rclpy.try_shutdown()

@@ -198,6 +198,8 @@ def test_a_bad_frame_is_damage(compression):
     with pytest.raises(Exception, match=r".") as caught, bag_checks.bag_errors("x", "remedy"):
         bag_checks.storage_mcap.decompress(b"no frame at all", compression, 100, 0)
     assert caught.type is BagError
+    assert str(caught.value).startswith("bag 'x' cannot be read: ")
+    assert "Error" not in str(caught.value)
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])

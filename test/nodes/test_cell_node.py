@@ -2,12 +2,15 @@
 
 import signal
 import sys
+from functools import partial
 
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 
-from omsm_ros.nodes import cell_node, managed
+from omsm_ros.nodes import cell_node, managed, running
+from omsm_ros.nodes.cell_emulator_node import CellEmulatorNode
+from omsm_ros.nodes.driver import ConfocalDriverNode
 
 
 def started(monkeypatch, *arguments):
@@ -56,3 +59,29 @@ def test_a_folder_without_the_file_is_named(monkeypatch, capsys, tmp_path):
     with pytest.raises(SystemExit):
         started(monkeypatch, "--params", str(tmp_path))
     assert str(tmp_path) in capsys.readouterr().err
+
+
+def test_the_emulator_closes_after_those_that_read_its_port(monkeypatch):
+    closed = []
+
+    class Node:
+        fatal = None
+
+        def __init__(self, kind):
+            self.kind, self.closes_last = kind, kind.closes_last
+
+        def start(self):
+            pass
+
+        def close(self):
+            closed.append(self.kind)
+
+        def destroy_node(self):
+            pass
+
+    for name in ("_init", "_SignalEnd", "_spin", "_ignore_signals", "freeze_garbage_collector"):
+        monkeypatch.setattr(running, name, lambda *_: None)
+    monkeypatch.setattr(running.rclpy, "try_shutdown", lambda: None)
+    kinds = (CellEmulatorNode, ConfocalDriverNode)
+    running.run(*(partial(Node, kind) for kind in kinds))
+    assert closed == [ConfocalDriverNode, CellEmulatorNode]

@@ -68,6 +68,8 @@ def test_hostile_calls_are_answered_and_survived(cell, files):
         assert answer.message
     answer = identify(input="x" * 100_000)
     assert len(answer.message) < 2000
+    assert "expected 'encoder' or 'reference'" in answer.message  # it has no samples either
+    assert "are published" in identify().message
     for order in (21, 2**31, 2**32 - 1):
         assert not identify(order=order).success
     answer = predict(z=WAVE, sample_period=1e-3)
