@@ -23,7 +23,7 @@ def one_thread_of_blas() -> None:
     os.environ.setdefault(_THREADS, "1")
 
 
-def signal_when_parent_ends(number: signal.Signals) -> None:
+def end_with_parent(number: signal.Signals) -> None:
     """Let Linux send ``number`` to this process when the one that started it ends, even killed."""
     if sys.platform == "linux":
         import ctypes

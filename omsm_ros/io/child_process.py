@@ -21,7 +21,7 @@ from typing import Any, TypeAlias, TypeVar, cast
 
 from omsm_ros.errors import FileError, OmsmError
 from omsm_ros.io.files import library_errors
-from omsm_ros.loading import signal_when_parent_ends
+from omsm_ros.loading import end_with_parent
 from omsm_ros.quantities import MAP_POINTS, shown
 
 T = TypeVar("T")
@@ -108,7 +108,7 @@ def _child(
     caller: int, sender: Connection, work: Callable[..., Any], most_bytes: int, tells: bool
 ) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the caller ends this process
-    signal_when_parent_ends(signal.SIGKILL)  # a killed caller cannot
+    end_with_parent(signal.SIGKILL)  # a killed caller cannot
     if os.getppid() != caller:
         return
     faulthandler.disable()  # and reports a crash in one line

@@ -11,11 +11,7 @@ import sys
 from pathlib import Path
 
 from omsm_ros.errors import FEWEST_OPEN_FILES, MORE_FILES, open_files
-from omsm_ros.loading import (
-    exit_on_signal_while_loading,
-    one_thread_of_blas,
-    signal_when_parent_ends,
-)
+from omsm_ros.loading import end_with_parent, exit_on_signal_while_loading, one_thread_of_blas
 from omsm_ros.nodes.memory import use_single_malloc_arena
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -100,7 +96,7 @@ def end_with_launch() -> None:
         return
     child = launch == str(os.getppid())  # not of a prefix, such as a terminal or debugger
     if child:
-        signal_when_parent_ends(signal.SIGTERM)
+        end_with_parent(signal.SIGTERM)
     if (child and launch != str(os.getppid())) or not os.path.exists(f"/proc/{launch}"):
         sys.exit(f"the launch that started this node ({launch}) has ended")
 

@@ -15,7 +15,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
@@ -26,26 +26,21 @@ from omsm_ros import quantities
 from omsm_ros.core.kinematics.kinematics import Geometry, beam_quaternion
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import json_and_yaml
-from omsm_ros.io.topics import TOPIC_TYPES
+from omsm_ros.io.topics import LATCHED_DEPTH, SAMPLES_DEPTH, TOPIC_TYPES
 from omsm_ros.quantities import Parameter
 
 MessageInfo: TypeAlias = "dict[str, int]"
 
-SAMPLES_QOS = QoSProfile(
-    # Reliable, and deep enough for several seconds of blocks, so that a loss is a fault.
-    reliability=ReliabilityPolicy.RELIABLE,
-    history=HistoryPolicy.KEEP_LAST,
-    depth=2000,
-)
+# Reliable, and deep enough for several seconds of blocks, so that a loss is a fault.
+SAMPLES_QOS = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, depth=SAMPLES_DEPTH)
 # By many: for subscribers of several latched publishers, the last to arrive may not be the newest.
 LATCHED_QOS, LATCHED_BY_MANY_QOS = (
     QoSProfile(
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL,
-        history=HistoryPolicy.KEEP_LAST,
         depth=depth,
     )
-    for depth in (1, 20)
+    for depth in (LATCHED_DEPTH, 20)
 )
 # Requests wait while a node computes; the usual depth of ten overflows soon.
 REQUESTS_QOS = QoSProfile(depth=1000)

@@ -143,5 +143,5 @@ def test_the_launch_that_is_gone_takes_its_node_with_it(monkeypatch):
 
 def test_a_launch_that_is_no_parent_is_left_to_itself(monkeypatch):
     monkeypatch.setenv(start.LAUNCHED_BY, str(os.getpid()))
-    monkeypatch.setattr(start, "signal_when_parent_ends", None)
+    monkeypatch.setattr(start, "end_with_parent", None)
     start.end_with_launch()
