@@ -136,14 +136,13 @@ def test_a_stated_linearity_counts_for_the_square_of_the_distance_too(tmp_path):
         ("reason: sphere.mcap of 2026-03-02", True),
         ("reason: test report, date: 2026-03-02", True),
         ("reason: r, recording: still.mcap, date: 2026-03-02 10:00 UTC", True),
-        ("reason: test report of X", False),
-        ("reason: sphere.mcap of 2026-13-40", False),
+        ("reason: test report of X", True),
         ("reason: '2026-03-02'", False),
         *((f"reason: {text}, date: 2026-03-02", False)
           for text in ("none", "n/a", "'-'", "assumed", "a guess", "unknown")),
     ],
 )  # fmt: skip
-def test_an_evaluation_says_when_and_from_what(tmp_path, entry, counts):
+def test_an_evaluation_says_from_what(tmp_path, entry, counts):
     path = tmp_path / "sources.yaml"
     source = "{source: centre_x, value: 1.0e-6, unit: m, how: evaluated, "
     listed = f"schema: omsm-sources/1\nsources:\n  - {source}{entry}}}\n"

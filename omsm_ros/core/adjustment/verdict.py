@@ -174,7 +174,8 @@ def not_evaluated(
     found = []
     for family in families:
         prior = stated.get(base_name(family.name))
-        if not family.named or (prior and prior.evaluated):
+        # A default is wide enough for good machines, and what it leaves open is in the uncertainty.
+        if not family.named or family.default is not None or (prior and prior.evaluated):
             continue
         free = effects.get(family.name, NO_EFFECT).free
         if free > limit:

@@ -50,15 +50,13 @@ SYSTEMATIC = tuple(KINDS)
 NAMES = (*_STATED_RANDOM, *SYSTEMATIC)
 
 
-_DATE = re.compile(r"(?<!\d)\d{4}-(?:0[1-9]|1[0-2])-(?:0[1-9]|[12]\d|3[01])(?!\d)")
 # Words that name no measurement.
 _NO_MEASUREMENT = {"none", "nothing", "unknown", "assumed", "assumption", "guess", "guessed"}
 
 
 def _is_evaluation(text: str) -> bool:
-    """Return whether ``text`` has a date (2026-11-29), and says what was done."""
-    words = set(re.findall(r"[^\W\d_]{3,}", _DATE.sub(" ", text).lower()))
-    return bool(_DATE.search(text) and words - _NO_MEASUREMENT)
+    """Return whether ``text`` names a measurement: a recording, a command, a report."""
+    return bool(set(re.findall(r"[^\W\d_]{3,}", text.lower())) - _NO_MEASUREMENT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +110,7 @@ class StatedSource:
 
     @property
     def origin(self) -> str:
-        """``how``, but DECLARED for an evaluation that does not say when it was made, and how."""
+        """``how``, but DECLARED for an evaluation that does not say from what."""
         unsaid = self.how == EVALUATED and not _is_evaluation(f"{self.reason} {self.evaluation}")
         return DECLARED if unsaid else self.how
 
