@@ -113,7 +113,8 @@ def form_map(
     raw = spread.T @ spread
     of_cells = made.member @ scipy.sparse.diags_array(made.share) @ made.member.T
     raw += of_cells.toarray()
-    covariance = made.free(made.free(raw).T) + open_changes @ open_changes.T
+    covariance = made.free(made.free(raw).T)
+    covariance += open_changes @ open_changes.T
     every, by_height = _term_fit(solution, places)
     alike = _resembled(made, covariance, every, by_height, effects or {}, solution.network.families)
     more = np.stack([np.zeros(len(made.height)), *(change for _, _, change in alike)], axis=1)

@@ -339,11 +339,11 @@ class Factor:
     def inverse(self) -> FloatArray:
         """Return A⁻¹ (p, p)."""
         made, _ = linalg.lapack.dpotri(self.root, lower=1)
-        lower = np.tril(made)
-        lower += np.tril(made, -1).T
-        lower *= self.scale
-        lower *= self.scale[:, np.newaxis]
-        return np.asarray(lower)
+        for k in range(len(made)):  # the lower half mirrored in place, it may be large
+            made[k, k + 1 :] = made[k + 1 :, k]
+        made *= self.scale
+        made *= self.scale[:, np.newaxis]
+        return np.asarray(made)
 
 
 @dataclass(frozen=True, eq=False)
