@@ -6,10 +6,11 @@ the disc to separate the terms, the highest orders are left out.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import comb
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
@@ -32,6 +33,11 @@ DIFFERENCES = 4
 _ROUNDING = 1e-12
 # Terms of the series 1 / (1 − h) in the share h, about a tenth, of a group in the fit.
 _FOLLOWED = 2
+# Width of the strip along the rim in which parabolas replace sums, and the largest distance of its
+# points from the outline, in tracks; places along the rim, and nodes across the strip.
+_STRIP, _REACH, _PLACES, _NODES = 4.0, 1.5, 480, 6
+# Points of a parabola; weight of its curvatures, and the least singular value that counts.
+_AROUND, _LEAST_CURVED, _LEAST_SPREAD = 24, 0.3, 1e-2
 
 
 def passes(x: FloatArray, y: FloatArray) -> IntArray | None:
@@ -102,12 +108,15 @@ def fit_zernikes(
     weights: FloatArray | None = None,
     effects: FloatArray | None = None,
     condition: float = _WORST_CONDITION,
+    rim: tuple[Aperture, float] | None = None,
 ) -> ZernikeFit:
     """Fit ``terms`` to ``deviation`` [m] at x, y [m] of the part, each (n,), by least squares.
 
     weights: area of each point (n,), None for equal weights
     effects: of errors on the deviations (e, n) [m], fitted in the same way
     condition: largest condition number of the terms; with a larger one the highest are left out
+    rim: outline of the part and distance of the tracks [m]; form that no term describes is then
+        continued from the last tracks to the outline, unless that is a polygon
 
     The covariance includes errors that are correlated over a pass of the path. Raises DataError
     for fewer than two points a term, or points that determine no term.
@@ -133,7 +142,7 @@ def fit_zernikes(
         root.T, np.linalg.solve(root, scale[:, np.newaxis] * right)
     )
     scores = _scores(x, y, deviation, found[:, 0], used, disc, weights, inverse)
-    return ZernikeFit(
+    fit = ZernikeFit(
         disc=disc,
         terms=used,
         coefficients=found[:, 0],
@@ -141,6 +150,119 @@ def fit_zernikes(
         left_out=tuple(t for t in terms if t not in used),
         effects=found[:, 1:],
     )
+    if rim is None:
+        return fit
+    points = np.stack([x, y, deviation, np.ones(len(x)) if weights is None else weights])
+    return _continued_to_rim(fit, points, inverse, *rim)
+
+
+def _continued_to_rim(
+    fit: ZernikeFit, points: FloatArray, inverse: FloatArray, outline: Aperture, spacing: float
+) -> ZernikeFit:
+    """Return the ``fit`` with what its sums over points miss along the rim.
+
+    Points there stand for the way to the outline, along which mid-spatial form changes. In a strip
+    that fades inwards, integrals of parabolas through neighbouring points replace the sums. Half
+    the difference to planes is a standard uncertainty, because the next order of a series is one
+    that the points do not show; another is the noise of the parabolas.
+
+    points: x, y, deviation [m] and weight (4, n);  inverse: of the Gram matrix (k, k)
+    spacing: of the tracks [m]
+    """
+    from scipy.sparse import csr_array  # these take long to load
+    from scipy.spatial import cKDTree
+
+    outline = outline.disc if outline.outline == "annulus" else outline
+    ends, rim = _around(outline)
+    depth = _STRIP * spacing / float(np.hypot(*rim).min())
+    size = outline.share_of_rim(points[0], points[1])
+    strip = size > 1 - 2 * depth
+    x, y, rest, weights = points[:, strip]
+    if outline.outline == "polygon" or depth >= 0.5 or len(x) < _AROUND:
+        return fit
+    rest = rest - fit.height(x, y)
+    (u, v, form), group = _means_along(np.stack([x, y, rest]), spacing)
+    if len(u) < _AROUND:
+        return fit
+    tree, middle = cKDTree(np.column_stack([u, v])), np.array([[outline.x], [outline.y]])
+    known = tree.query((rim + middle).T)[0] < _REACH * spacing
+    nodes, shares = np.polynomial.legendre.leggauss(_NODES)
+    inwards = depth * (nodes + 1) / 2
+    triangles = np.abs(ends[0, :-1] * ends[1, 1:] - ends[1, :-1] * ends[0, 1:]) / 2
+    shares = (1 - inwards) * depth * shares * _fading(inwards / depth)
+    at = (rim[:, :, np.newaxis] * (1 - inwards)).reshape(2, -1) + middle
+    near = tree.query(at.T, _AROUND)[1]
+    places = (u[near] - at[0, :, np.newaxis]) + 1j * (v[near] - at[1, :, np.newaxis])
+    outwards = np.repeat(rim[0] - 1j * rim[1], _NODES)[:, np.newaxis]
+    shares_of = _continued(places * outwards / np.abs(outwards) / spacing)
+    area = np.outer(triangles * known, shares).ravel() * np.sum(points[3]) / np.sum(triangles)
+    terms = zernike_values(*fit.disc.scaled(*at), fit.terms) * area
+    parabola, plane = (terms @ np.sum(each * form[near], axis=1) for each in shares_of)
+    nearest = cKDTree((rim + middle).T).query(np.column_stack([x, y]))[1]
+    weights = weights * known[nearest] * _fading((1 - size[strip]) / depth)
+    weighted = zernike_values(*fit.disc.scaled(x, y), fit.terms) * weights
+    # Each mean counts as a value of its own in the integrals, and less in the sums.
+    ends_of = np.arange(len(area) + 1) * _AROUND
+    every = csr_array((shares_of[0].ravel(), near.ravel(), ends_of), (len(area), len(u)))
+    more = terms @ every
+    for row, term in zip(more, weighted, strict=True):
+        row -= np.bincount(group, term[: len(group)], len(u))
+    noise = np.diff(rest, 2).std() / np.sqrt(6 * len(group) / len(u))
+    errors = inverse @ np.column_stack([(parabola - plane) / 2, noise * more])
+    return replace(
+        fit,
+        coefficients=fit.coefficients + inverse @ (parabola - weighted @ rest),
+        covariance=fit.covariance + errors @ errors.T,
+    )
+
+
+def _means_along(points: FloatArray, spacing: float) -> tuple[FloatArray, IntArray]:
+    """Return means of successive ``points`` (3, n) [m] half a track long, and whose each is.
+
+    The nearest single points may lie on one track. Jumps to another line have no mean.
+    """
+    step = float(np.median(np.hypot(*np.diff(points[:2]))))
+    along = max(int(spacing / 2 / step), 1) if step else 1
+    groups = points[:, : points.shape[1] // along * along].reshape(3, -1, along)
+    together = np.max(np.ptp(groups[:2], axis=2), axis=0) < spacing
+    whose = np.repeat(np.maximum(np.cumsum(together) - 1, 0), along)
+    return np.mean(groups[:, together], axis=2), np.asarray(whose, np.int64)
+
+
+def _around(outline: Aperture) -> tuple[FloatArray, FloatArray]:
+    """Return ends (2, q + 1) and middles (2, q) of parts of the outer rim [m], from its middle."""
+    corners, middle = outline.rim(), np.array([[outline.x], [outline.y]])
+    way = np.cumsum(np.hypot(*np.diff(corners, prepend=corners[:, :1])))
+    at = np.linspace(0, way[-1], _PLACES + 1)
+    ends = np.stack([np.interp(at, way, v) for v in corners])
+    ends = (ends - middle) / outline.share_of_rim(*ends)
+    rim = (ends[:, 1:] + ends[:, :-1]) / 2
+    return ends, rim / outline.share_of_rim(*(rim + middle))
+
+
+def _continued(places: NDArray[np.complex128]) -> FloatArray:
+    """Return shares of values in the parabola and the plane through them at each node (2, q, k).
+
+    places: of the values from the node (q, k). Curvature that they do not show is zero.
+    """
+    u, v = places.real, places.imag
+    curved = [_LEAST_CURVED * each for each in (u * u, u * v, v * v)]
+    columns = np.stack([np.ones_like(u), u, v, *curved], axis=-1)
+    gram = np.swapaxes(columns, 1, 2) @ columns
+    found = []
+    for kept in (6, 3):
+        own = gram[:, :kept, :kept]
+        ridge = _LEAST_SPREAD**2 * np.trace(own, axis1=1, axis2=2)[:, np.newaxis, np.newaxis]
+        first = np.eye(kept)[:, :1]
+        solved = np.linalg.solve(own + ridge * np.diag(np.arange(kept) > 0), first)
+        found.append((columns[..., :kept] @ solved)[..., 0])
+    return np.stack(found)
+
+
+def _fading(inwards: FloatArray) -> FloatArray:
+    """Return weights that fall smoothly from 1 at the rim, 0, to 0 at 1."""
+    s = np.clip(inwards, 0.0, 1.0)
+    return np.asarray(1 - s**3 * (10 - 15 * s + 6 * s**2))
 
 
 def _normal_equations(
