@@ -83,6 +83,18 @@ def test_the_manifest_names_all_that_is_imported_and_nothing_else(needed):
     assert declared == keys - {None}
 
 
+def test_the_manifest_names_the_ros_packages_that_the_tests_import():
+    package = parsed(ROOT)
+    declared = {each.name for each in (*package.exec_depends, *package.test_depends)}
+    texts = (path.read_text(encoding="utf-8") for path in (ROOT / "test").rglob("*.py"))
+    used = {
+        name
+        for text in texts
+        for name in re.findall(r"^(?:from|import) (\w+_(?:msgs|srvs|interfaces))\b", text, re.M)
+    }
+    assert {"action_msgs", "std_srvs"} <= used <= declared
+
+
 def test_what_is_built_against_is_also_there_at_run_time():
     package = parsed(ROOT)
     built = {dependency.name for dependency in package.build_depends}

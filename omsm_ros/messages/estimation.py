@@ -33,8 +33,8 @@ estimation.no_fast_mode: mode in equivalent time: not resolved. The edges do not
     to omsm plan steps
 # Preparation.
 estimation.unknown_input: input {input!r}, expected 'encoder' or 'reference'
-estimation.no_reference: input 'reference', but the recording has no reading of a reference sensor;
-    record /omsm/reference or use input 'encoder'
+estimation.no_reference: input 'reference', but there is no reading of a reference sensor; publish
+    /omsm/reference, or record it, or use input 'encoder'
 estimation.few_compared: {compared} of {samples} samples can be compared: the others are lost, or
     recorded while a transient settles or the motion starts or ends; record at least {least} more
 estimation.implausible_gain: the probe moves by {gain:plain} per travel of the axis, expected about

@@ -72,5 +72,5 @@ def test_without_a_reference_it_cannot_be_the_input(cell, step_test):
     cell.wait("all", lambda: cell.operator.value("calibrator", "distance_held") == samples)
     answer = cell.call(Identify, "calibrator/identify", input="reference")
     assert not answer.success
-    assert "/omsm/reference" in answer.message
+    assert "publish /omsm/reference" in answer.message
     assert not (cell.folder / "cal.json").exists()
