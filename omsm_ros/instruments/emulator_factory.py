@@ -7,6 +7,7 @@ import os
 import select
 import socket
 import threading
+import time
 import tty
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -183,6 +184,12 @@ class Pty:
             ) from err
 
     def __exit__(self, *_: object) -> None:
+        """Remove the port once no driver has it open; one that ends with the cell has left soon."""
+        until = time.monotonic() + _LEAVE_S
+        while self._master is not None and time.monotonic() < until:
+            if self._events(0.0) & select.POLLHUP:
+                break
+            time.sleep(_LOOK_S)
         self.unplug()
 
     def unplug(self) -> None:
@@ -249,7 +256,7 @@ class Pty:
 _TCP = "tcp://127.0.0.1:"
 # Most digits of a port, since ``int`` refuses thousands of them.
 _PORT_DIGITS = 10
-_END_S = 5.0
+_END_S, _LEAVE_S = 5.0, 1.0
 # The twin's probe measures about its middle, an emulated one from the beginning of its range.
 TWIN_READING = ProbeReading(full_scale=100 * MICROMETRE_M, zero=Probe().half_range)
 OWN_ENCODERS: dict[str, object] = {"trigger": "each", "probe.zero": TWIN_READING.zero} | {

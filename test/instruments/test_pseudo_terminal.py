@@ -138,3 +138,20 @@ def test_a_reader_that_leaves_ends_the_wait(pty: Pty, driver: SerialTransport) -
 def test_use_outside_the_with_block_is_named() -> None:
     with pytest.raises(DeviceError, match="with block"):
         Pty().write(b"x")
+
+
+def test_a_driver_that_ends_together_with_the_port_does_not_lose_it(tmp_path: Path) -> None:
+    left: list[bool] = []
+    with Pty(tmp_path / "probe") as pty:
+        line = os.open(pty.path, os.O_RDWR | os.O_NOCTTY)
+
+        def leave() -> None:
+            left.append(True)
+            os.close(line)
+
+        leaving = threading.Timer(0.3, leave)
+        leaving.start()
+        pty.__exit__()
+        assert left
+        leaving.join()
+    assert not (tmp_path / "probe").exists()
