@@ -57,6 +57,10 @@ _QUANTILE = 1.0364
 OUTLIER_SIGMAS = 5.0
 # A deviation that more than 5 % of the points reach is part of the form; the factor is a margin.
 _MOST_DUST, _BEYOND_COMMON = 0.05, 1.2
+# Least eigenvalue of columns that are no copies. Those that are nearly alike differ at few points,
+# and large multiples of them that cancel would follow dust there: bound of the rms of a multiple
+# over that of the deviation.
+_ROUNDING, _MOST_CANCELLED = 1e-12, 100.0
 # Rounding of a nominal surface against itself is no outlier.
 LEAST_LIMIT_M = 1e-12
 # The second fit is already nearly free of dust.
@@ -326,7 +330,11 @@ def best_matching_sum(columns: FloatArray, deviation: FloatArray) -> tuple[Float
         far = columns[:, ~chosen]
         gram = (whole - far @ far.T) / np.outer(scale, scale)
         right = columns @ np.where(chosen, deviation, 0.0) / scale
-        fitted = np.asarray(np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ right / scale)
+        values, ways = np.linalg.eigh(gram)
+        sums = ways.T @ right / np.maximum(values, _ROUNDING * values[-1])
+        most = _MOST_CANCELLED * np.sqrt(np.mean(deviation[chosen] ** 2))
+        known = (values > _ROUNDING * values[-1]) & (np.abs(sums) <= most)
+        fitted = np.asarray(ways @ np.where(known, sums, 0.0) / scale)
         residual = deviation - fitted @ columns
         limit = outlier_limit(residual)
         if np.array_equal(np.abs(residual) <= limit, chosen):

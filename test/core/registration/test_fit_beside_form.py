@@ -234,6 +234,17 @@ def test_a_sum_of_columns_is_found_whatever_a_few_specks_do():
     assert limit < 1e-8
 
 
+def test_columns_that_are_nearly_alike_do_not_follow_a_speck():
+    """They differ at one point only, where multiples a million times the form would fit dust."""
+    x = np.linspace(-1, 1, 2000)
+    columns = np.stack([x**2, x**2 + 1e-3 * (x == x[-1])])
+    deviation = 1e-7 * x**2 + 1e-9 * RNG.normal(size=2000)
+    deviation[-1] += 1e-5
+    found, limit = best_matching_sum(columns, deviation)
+    assert abs(deviation[-1] - (found @ columns)[-1]) > 100 * limit
+    np.testing.assert_allclose(found @ columns[:, 500], 1e-7 * x[500] ** 2, rtol=0.02)
+
+
 def test_without_specks_it_is_the_least_squares_of_numpy():
     columns = RNG.normal(size=(3, 500))
     deviation = RNG.uniform(-1, 1, 500)
