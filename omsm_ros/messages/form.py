@@ -15,6 +15,8 @@ form.uncovered: {share:%} of the aperture has no points, and all figures are of 
     all, or state the aperture that counts with {opt.aperture}
 form.excluded_points: {count:count} points left out as dust, up to {largest:m} off, may be defects;
     inspect them, then exclude them with {opt.dust} isolated or keep them with {opt.dust} none
+form.excluded_on_request: with the points excluded by {opt.dust}, peak to valley may be {height:m};
+    neither the figures nor the tolerance contain them
 form.low_pass_too_short: low-pass of {low_pass!r} m is finer than the points resolve, expected
     {least!r} m or more; measure more points, or compensate less
 form.one_row: the points lie within one row of cells of {pitch!r} m, so that nothing is known across

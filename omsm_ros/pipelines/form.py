@@ -21,7 +21,7 @@ from omsm_ros.core.surface.deviation import mismatch
 from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints, without_duplicates
 from omsm_ros.core.surface.shape_parameters import external
-from omsm_ros.errors import FileError
+from omsm_ros.errors import FileError, Notice
 from omsm_ros.io.files import CLOUD, CURVES, DEVIATION, FORM, SYSTEMATIC, save_json
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.maps.vertex_file import write_ply
@@ -169,6 +169,10 @@ def judge_form(
     form = measured.form(surface, how)
     facts = form_facts(form, measured)
     doubts = form.doubts(decided=how.dust is not None)
+    if how.dust is not None:
+        hidden = [d.peak_to_valley for d in form.doubts() if d.peak_to_valley is not None]
+        excluded = [Notice("form.excluded_on_request", height=height) for height in hidden]
+        facts["removed"]["notes"] += map(str, excluded)
     facts["open"] = [{"reason": str(d.reason), "peak_to_valley": d.peak_to_valley} for d in doubts]
     if how.tolerance is not None:
         found = conformity(form.deviation["peak_to_valley"], how.tolerance, doubts)

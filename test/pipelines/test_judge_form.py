@@ -170,11 +170,25 @@ def test_the_page_answers_first_and_has_every_figure(folder, tmp_path, capsys):
     assert status == 0
     assert json.loads(path.read_text())["conformity"]["verdict"] == "holds"
     said = capsys.readouterr().out
-    for text in ("holds", "rms of points", "not evaluated", f"{count(POINTS)} read"):
+    for text in (
+        "holds",
+        "peak to valley may be",
+        "rms of points",
+        "not evaluated",
+        f"{count(POINTS)} read",
+    ):
         assert text in said
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/png;base64,") == 8
-    for text in (*("Form of the part", "Not verified", "Uncertainty budget incomplete", "Sku"),):
+    for text in (
+        *(
+            "Form of the part",
+            "peak to valley may be",
+            "Not verified",
+            "Uncertainty budget incomplete",
+            "Sku",
+        ),
+    ):
         assert text in page
     curves = json.loads((tmp_path / "curves.json").read_text())
     psd = curves["psd"]
