@@ -170,8 +170,8 @@ def judge_form(
     facts = form_facts(form, measured)
     doubts = form.doubts(decided=how.dust is not None)
     if how.dust is not None:
-        hidden = [d.peak_to_valley for d in form.doubts() if d.peak_to_valley is not None]
-        excluded = [Notice("form.excluded_on_request", height=height) for height in hidden]
+        reached = [d.peak_to_valley for d in form.doubts() if d.peak_to_valley is not None]
+        excluded = [Notice("form.excluded_on_request", height=height) for height in reached]
         facts["removed"]["notes"] += map(str, excluded)
     facts["open"] = [{"reason": str(d.reason), "peak_to_valley": d.peak_to_valley} for d in doubts]
     if how.tolerance is not None:

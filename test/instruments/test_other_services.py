@@ -13,6 +13,7 @@ from omsm_ros.instruments.chrocodile.packet_protocol import PacketCommand, encod
 from omsm_ros.instruments.micro_epsilon.device import ConfocalDtDevice, ConfocalDtSettings
 from omsm_ros.instruments.micro_epsilon.protocol import encode_frames
 from omsm_ros.instruments.six_channel.device import CsvSettings, CsvStreamDevice
+from omsm_ros.instruments.stream import StreamDevice
 
 from .scripted_stream import Script
 
@@ -46,6 +47,13 @@ def test_a_service_that_repeats_what_it_hears_is_no_device() -> None:
         device.open()
 
 
+def poll_each(device: StreamDevice, portions: int, now: list[float]) -> None:
+    """Read portions of a tenth of a second."""
+    for _ in range(portions):
+        now[0] += 0.1
+        device.poll(0.0)
+
+
 def test_a_counter_that_stands_still_is_reported() -> None:
     """The frame has intensity and counter the other way round than the settings say."""
     now = [0.0]
@@ -58,13 +66,8 @@ def test_a_counter_that_stands_still_is_reported() -> None:
     )
     device.open()
 
-    def read() -> None:
-        for _ in frames:
-            now[0] += 0.1
-            device.poll(0.0)
-
     with pytest.raises(NoSamplesError, match=r"repeats its sample counter \(512\)"):
-        read()
+        poll_each(device, len(frames), now)
     assert now[0] < 2.5
 
 
@@ -74,19 +77,14 @@ def test_a_counter_that_stands_still_is_reported_although_time_goes_on(
 ) -> None:
     now = [0.0]
     row = "{} {} {}\n" if len(columns) == 3 else "{} {}\n"
-    lines = [row.format(7, *(k * 10**6, k)[4 - len(columns) - 1 :]) for k in range(4000)]
+    lines = [row.format(7, *(k * 10**6, k)[3 - len(columns) :]) for k in range(4000)]
     portions = ["".join(lines[i : i + 100]).encode() for i in range(0, 4000, 100)]
     device = CsvStreamDevice(
         Script(*portions), CsvSettings(columns=columns), lambda: round(now[0] * 1e9), lambda: now[0]
     )
     device.open()
 
-    def read() -> None:
-        for _ in portions:
-            now[0] += 0.1
-            device.poll(0.0)
-
     with pytest.raises(NoSamplesError, match=r"repeats its sample counter \(7\)"):
-        read()
+        poll_each(device, len(portions), now)
     found = device.statistics
     assert (found.restarts, found.duplicates + found.held) == (0, found.decoded - 1)

@@ -439,9 +439,9 @@ def _of_each(r: Ranges, columns: Columns) -> Columns:
 
 
 def _fading(name: str, unit: str, r: Ranges, shapes: Columns, number: int, wide: float) -> Family:
-    """Return ``number`` shapes of a part that gives way in its clamping, and is at rest later.
+    """Return ``number`` shapes of a part that gives way in its clamping, and settles.
 
-    The form is that of the part at rest, so that the slowest course leaves it uncertain.
+    The form is that of the settled part, so that the slowest course leaves it uncertain.
     """
     times = r.duration * np.array([*_FADING, 1.0])
 

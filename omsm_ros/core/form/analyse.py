@@ -235,8 +235,8 @@ def analyse_form(
     bounded = [*[n for n, s in enumerate(sources) if s in bounds], *held]
     map_ = gathered.map(found, area_weights(x, y, even=even, outline=outline), bounded)
     points, terms = (map_.x, map_.y, map_.deviation), ZERNIKES[: len(map_) // 2]
-    known = {"weights": map_.area, "effects": map_.effects, "rim": (outline, found.spacing)}
-    fit = fit_zernikes(*points, terms, found.disc, **known)  # type: ignore[arg-type]
+    area, effects, rim = map_.area, map_.effects, (outline, found.spacing)
+    fit = fit_zernikes(*points, terms, found.disc, weights=area, effects=effects, rim=rim)
     zernike = with_pose_uncertainty(fit, map_, found)
     cells = GridCells.of(map_, even=even)
     bands = bands_of(cells, *filters)

@@ -58,9 +58,9 @@ def test_a_circle_is_no_spiral(table):
     assert scan.is_spiral
     circle = replace(scan, x=RADIUS_M * np.cos(scan.c), y=-RADIUS_M * np.sin(scan.c))
     assert not circle.is_spiral
-    with pytest.raises(DataError, match="scan 2 is no spiral") as told:
+    with pytest.raises(DataError, match="scan 2 is no spiral") as refused:
         adjust([scan, circle], PRIORS, nominal=MIRROR)
-    assert told.value.code == "adjustment.no_spiral"
+    assert refused.value.code == "adjustment.no_spiral"
 
 
 def test_the_lag_is_found_to_a_fifth_of_a_microsecond(table):
