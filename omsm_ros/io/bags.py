@@ -21,13 +21,13 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Connection
+from rosbags.rosbag2 import Reader
 
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.errors import BagError, CalibrationError, DataError
 from omsm_ros.io import message_mapping
 from omsm_ros.io.bag_checks import (
     DAMAGED,
-    MessageReader,
     bag_errors,
     check_checksums,
     check_definition,
@@ -217,7 +217,7 @@ class BagReader:
             check_files(self.path)
             if self.path.is_file():
                 check_kind(self.path)
-            self._reader = opening.enter_context(MessageReader(self.path))
+            self._reader = opening.enter_context(Reader(self.path))
             check_index(self.path, self._reader)
             check_checksums(self.path)
             held = {c.topic: c.msgtype for c in self._reader.connections}

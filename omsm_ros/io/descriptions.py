@@ -27,9 +27,9 @@ from omsm_ros.core.surface.nominal import SHAPES
 from omsm_ros.core.surface.posed import Pose, PosedSurface
 from omsm_ros.errors import ConfigurationError, DataError, FileError, SurfaceError, named_errors
 from omsm_ros.io.files import load_object, read_text, save_text
-from omsm_ros.io.json_and_yaml import NUMBER, as_number, check_form, form
+from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
 from omsm_ros.io.tables.text_table import load_columns
-from omsm_ros.quantities import PITCH, POSITION, SAMPLE_PERIOD, TIME, shown
+from omsm_ros.quantities import PITCH, POSITION, SAMPLE_PERIOD, TIME
 
 if TYPE_CHECKING:  # commands other than those of the twin do not load it
     from omsm_ros.twin.disturbances import Disturbances
@@ -37,6 +37,7 @@ if TYPE_CHECKING:  # commands other than those of the twin do not load it
 MAX_YAML_BYTES = 100_000
 # More than the lines or harmonics of any machine; each costs time at each sample.
 _MOST_ITEMS = 100
+_NAMED: Mapping[str, Any] = {"type": "object"}
 
 _T = TypeVar("_T")
 
@@ -65,37 +66,49 @@ def _load(kind: type[_T], path: Path | str | None, what: str) -> _T:
     """Read a record of numbers, and of records of them; FileError for another name or value."""
     if path is None:
         return kind()
-    content = load_object(path, what, MAX_YAML_BYTES, _schema_of(kind), yaml=True)
-    with named_errors(FileError, f"{what} {str(path)!r}", ConfigurationError):
-        return _made(kind, content)  # type: ignore[no-any-return]
+    content = load_object(path, what, MAX_YAML_BYTES, _schema_of(kind, _MOST_ITEMS), yaml=True)
+    return _made(kind, content, f"{what} {str(path)!r}", FileError)  # type: ignore[no-any-return]
 
 
-def _schema_of(kind: Any) -> Mapping[str, Any]:
-    """Return the JSON schema of a field's type: record, row of records, number, any or none."""
-    kind = _present(kind)
+def _schema_of(hint: Any, most: int) -> Mapping[str, Any]:
+    """Return the JSON schema of a field's type; ``most``: items of a list."""
+    kind = _present(hint)
     if is_dataclass(kind):
-        hints = get_type_hints(kind)
-        return form({f.name: _schema_of(hints[f.name]) for f in fields(kind)}, _required(kind))
+        own, hints = [each for each in fields(kind) if each.init], get_type_hints(kind)
+        needed = [f.name for f in own if f.default is MISSING and f.default_factory is MISSING]
+        return form({each.name: _schema_of(hints[each.name], most) for each in own}, needed)
     if get_origin(kind) is tuple:
-        items = _schema_of(get_args(kind)[0])
-        return {"type": "array", "items": items, "maxItems": _MOST_ITEMS}
-    return _INTEGER if kind is int else NUMBER
+        return {"type": "array", "items": _schema_of(get_args(kind)[0], most), "maxItems": most}
+    if get_origin(kind) is Literal:
+        return {"enum": list(get_args(kind))}
+    return {float: NUMBER, int: {"type": "integer"}}.get(kind, _NAMED)
 
 
-def _required(kind: Any) -> list[str]:
-    known = (each for each in fields(kind) if each.init)
-    return [f.name for f in known if f.default is MISSING and f.default_factory is MISSING]
-
-
-def _made(kind: Any, content: Any) -> Any:
-    kind = _present(kind)
+def _made(
+    hint: Any, content: Any, what: str, error: type[FileError], folder: Path | None = None
+) -> Any:
+    """Return the record, list or number of ``content``, which follows the schema of its type."""
+    kind = _present(hint)
+    if kind is Surface:
+        if "aperture" in content:
+            raise SurfaceError("surface.nested_aperture")
+        return surface_of(content, what, folder)
     if is_dataclass(kind):
         make: Any = kind
         hints = get_type_hints(kind)
-        return make(**{name: _made(hints[name], value) for name, value in content.items()})
+        values = {n: _made(hints[n], v, f"{what}: {n}", error, folder) for n, v in content.items()}
+        with named_errors(error, what):
+            return make(**values)
     if get_origin(kind) is tuple:
-        return tuple(_made(get_args(kind)[0], item) for item in content)
-    return int(content) if kind is int else content  # a number as it is written, for messages
+        each = get_args(kind)[0]
+        return tuple(_made(each, v, f"{what}[{k}]", error, folder) for k, v in enumerate(content))
+    return kind(content) if kind in (int, float) else content
+
+
+def _present(hint: Any) -> Any:
+    if get_origin(hint) in (types.UnionType, Union):
+        return next(kind for kind in get_args(hint) if kind is not types.NoneType)
+    return hint
 
 
 def load_pitch(path: Path | str) -> PitchCurve:
@@ -238,12 +251,10 @@ def _stated(item: Mapping[str, Any]) -> StatedSource:
 
 # Each shape is evaluated at each point; in a turned frame by Newton's method, some five times, and
 # in two nested frames twenty-five times.
-MOST_SHAPES, MOST_FRAMES = 50, 3
+MOST_SHAPES, MOST_FRAMES, _MOST_TERMS = 50, 3, 1000
 _GRID = "grid"
-_INTEGER: Mapping[str, Any] = {"type": "integer"}
 # Value of a parameter that is fitted, where none is stated [m], [1]; the estimate does not keep it.
 _START = 0.1
-_LIST: Mapping[str, Any] = {"type": "array", "maxItems": 1000}
 
 
 def load_surface(path: Path | str, fitted: Sequence[str] = ()) -> Surface:
@@ -287,20 +298,23 @@ def surface_of(description: Mapping[str, Any], what: str, folder: Path | None = 
     folder: of the files that it names; None = it may name no files
     """
     values = dict(description)
-    shape, pose = values.pop("shape", None), values.pop("pose", None)
-    aperture = values.pop("aperture", None)
-    named = {"shape": shape} if shape is not None else {}
+    common = {n: v for n in ("shape", "pose", "aperture") if (v := values.pop(n, None)) is not None}
     known = sorted([*SHAPES, *([_GRID] if folder is not None else [])])
-    check_form(named, form({"shape": {"enum": known}}, ("shape",)), SurfaceError, what)
+    schema = {"shape": {"enum": known}, "pose": _schema_of(Pose, 0), "aperture": {}}
+    check_form(common, form(schema, ("shape",)), SurfaceError, what)
+    shape = common["shape"]
+    named = f"{what}: {shape}"
     if shape == _GRID:
-        surface = _grid(values, f"{what}: {shape}", folder or Path())
+        surface = _grid(values, named, folder or Path())
     else:
-        surface = _record(SHAPES[shape], values, f"{what}: {shape}", folder)
-    if pose is not None:
-        surface = PosedSurface(surface, _value(Pose, pose, f"{what}: pose", folder))
-    if aperture is None:
+        check_form(values, _schema_of(SHAPES[shape], _MOST_TERMS), SurfaceError, named)
+        surface = _made(SHAPES[shape], values, named, SurfaceError, folder)
+    if "pose" in common:
+        pose = _made(Pose, common["pose"], f"{what}: pose", SurfaceError)
+        surface = PosedSurface(surface, pose)
+    if "aperture" not in common:
         return surface
-    return BoundedSurface(surface, Aperture.parse(str(aperture)))
+    return BoundedSurface(surface, Aperture.parse(str(common["aperture"])))
 
 
 def _grid(values: Mapping[str, Any], what: str, folder: Path) -> Surface:
@@ -319,53 +333,3 @@ def _grid(values: Mapping[str, Any], what: str, folder: Path) -> Surface:
                 "'omsm export --spacing'"
             )
         return GridSurface(grid)
-
-
-def _record(kind: Any, values: Mapping[str, Any], what: str, folder: Path | None) -> Any:
-    known = [each for each in fields(kind) if each.init]
-    hints = get_type_hints(kind)
-    schema = form({each.name: _schema(hints[each.name]) for each in known}, _required(kind))
-    check_form(values, schema, SurfaceError, what)
-    made = {n: _value(hints[n], v, f"{what}: {n}", folder) for n, v in values.items()}
-    with named_errors(SurfaceError, what):
-        return kind(**made)
-
-
-def _schema(hint: Any) -> Mapping[str, Any]:
-    if _choices(hint):
-        return {"enum": list(_choices(hint))}
-    if get_origin(hint) is tuple:
-        return _LIST
-    return {int: _INTEGER, float: NUMBER}.get(_present(hint), {})
-
-
-def _value(hint: Any, value: Any, what: str, folder: Path | None) -> Any:
-    if value is None and _present(hint) is not hint:
-        return None
-    kind = _present(hint)
-    if get_origin(kind) is tuple:
-        each = get_args(kind)[0]
-        return tuple(_value(each, v, f"{what}[{k}]", folder) for k, v in enumerate(value))
-    if kind is float:
-        if not isinstance(value, int | float) or isinstance(value, bool):
-            raise SurfaceError(f"{what} is {shown(value)}, expected a number{as_number(value)}")
-        return float(value)
-    if kind is Surface or is_dataclass(kind):
-        if not isinstance(value, dict):
-            raise SurfaceError(f"{what} is {shown(value)}, expected names and values")
-        if kind is Surface:
-            if "aperture" in value:
-                raise SurfaceError("surface.nested_aperture")
-            return surface_of(value, what, folder)
-        return _record(kind, value, what, folder)
-    return value
-
-
-def _present(hint: Any) -> Any:
-    if get_origin(hint) in (types.UnionType, Union):
-        return next(kind for kind in get_args(hint) if kind is not types.NoneType)
-    return hint
-
-
-def _choices(hint: Any) -> tuple[Any, ...]:
-    return get_args(hint) if get_origin(hint) is Literal else ()

@@ -291,7 +291,7 @@ _KINDS = {
 }  # fmt: skip
 
 
-def as_number(value: object) -> str:
+def _as_number(value: object) -> str:
     """Return the remedy for a text ``value`` in the place of a number; empty for others."""
     text = isinstance(value, str)
     return "; write digits with a decimal point, without unit and quotes" if text else ""
@@ -314,7 +314,7 @@ def _said_of_schemas(found: jsonschema.ValidationError) -> str:
             return f"{missing[0]} is required and missing; write it there"
         case "type":
             kinds = [wanted] if isinstance(wanted, str) else wanted
-            hint = as_number(found.instance) if "number" in kinds else ""  # type: ignore[operator]
+            hint = _as_number(found.instance) if "number" in kinds else ""  # type: ignore[operator]
             return f"{said}, expected {' or '.join(_KINDS[kind] for kind in kinds)}{hint}"  # type: ignore[union-attr]
         case "minimum" | "maximum":
             low, high = (found.schema.get(name) for name in ("minimum", "maximum"))  # type: ignore[union-attr]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from omsm_ros.errors import BagError
@@ -136,6 +136,22 @@ def test_every_chunk_carries_its_checksum(written):
             chunks += 1
         place += 9 + length
     assert chunks >= 1
+
+
+def test_a_length_that_does_not_fit_its_chunk_is_damage_without_checksums_too(tmp_path, written):
+    with Reader(written) as bag:
+        start = bag.storage.chunks[0].chunk_start_offset
+    for length in (10**6, 3):
+        whole = bytearray(written.read_bytes())
+        whole[start + 33 : start + 37] = whole[-12:-8] = bytes(4)  # of the chunk, of the index
+        place = start + 49  # the first record within
+        while whole[place] != 5:
+            place += 9 + struct.unpack_from("<Q", whole, place + 1)[0]
+        struct.pack_into("<Q", whole, place + 1, length)
+        path = tmp_path / f"{length}.mcap"
+        path.write_bytes(whole)
+        with pytest.raises(BagError, match=r"damaged.*--repair"):
+            records(path)
 
 
 def test_a_changed_byte_gives_the_same_blocks_or_is_seen(tmp_path, written):

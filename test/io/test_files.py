@@ -232,7 +232,7 @@ def test_a_wrong_surface_file_is_refused_by_name(tmp_path, text, named):
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("centre_x: 50\n", "centre_x is 50 m"),
+        ("centre_x: 50\n", "centre_x is 50.0 m"),
         ("beam_x: 3\n", "beam_x"),
         ("centre_z: 0.1\n", "'centre_z' is unknown"),
         ("beam_y: steep\n", "beam_y is 'steep'"),

@@ -60,7 +60,7 @@ def test_each_limit_is_read_under_its_own_name_and_no_other_changes(file, name):
     [
         ("servo: 50\n", r"'servo' is unknown, expected one of \['exposure', 'motion_frequency'"),
         ("z_jerk: fast\n", "z_jerk is 'fast', expected a number; write digits with a decimal"),
-        ("z_jerk: 0\n", "z_jerk is 0 .*expected a number from"),
+        ("z_jerk: 0\n", "z_jerk is 0.0 .*expected a number from"),
         ("z_jerk: -3.0\n", "z_jerk is -3.0 .*expected a number"),
         ("exposure: 1e13\n", "exposure is 1.*give it in seconds"),
         ("- 3\n", "expected 'name: value' lines"),
