@@ -296,7 +296,7 @@ def twin_sources() -> MachineSources:
 def form_truth(part: FigureError, found: Adjustment) -> dict[str, float]:
     """Return the true PV and rms of the part, pose removed, and the error of the map (rms)."""
     form = found.form
-    error = part.error(form.x, form.y)
+    error = part.deviation(form.x, form.y)
     columns = np.stack([np.ones_like(form.x), form.x, form.y], axis=1)
     weight = np.sqrt(form.area)[:, np.newaxis]
 

@@ -174,7 +174,7 @@ def _against_reference(out: Path, scenario: Scenario, cloud: np.ndarray) -> floa
     radius, angle = np.sqrt((k + 0.5) / len(k)) * size, k * np.pi * (3 - 5**0.5)
     x = PAPER_MIRROR_HALF_LENGTH_M * radius * np.cos(angle)
     y = PAPER_MIRROR_RADIUS_M * radius * np.sin(angle)
-    error = scenario.part.error(x, y) + 1e-6 + 20e-6 * x - 10e-6 * y
+    error = scenario.part.deviation(x, y) + 1e-6 + 20e-6 * x - 10e-6 * y
     error = error + random.normal(0.0, 5 * NANOMETRE_M, len(k))
     write_columns(out / "second_instrument.csv", {
         "x_m": x, "y_m": y, "z_m": error + PAPER_MIRROR.height(x, y)}, csv=True)  # fmt: skip

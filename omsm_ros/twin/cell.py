@@ -25,12 +25,13 @@ from omsm_ros.core.streams.blocks import (
 )
 from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.errors import DataError
+from omsm_ros.quantities import LENGTH, SAMPLE_PERIOD, CheckedRecord
 from omsm_ros.twin.disturbances import Disturbances, TrueResponse, Vibration
 from omsm_ros.twin.machine_errors import Shift, random_walk
 from omsm_ros.twin.part import UnderSpot, mounted_surface
 from omsm_ros.twin.plant import Plant, TimeGrid, Trajectory, move
 from omsm_ros.twin.probe import LEVEL, Probe, read, slope_of
-from omsm_ros.twin.record_checks import CheckedNumbers, is_default
+from omsm_ros.twin.record_checks import is_default
 from omsm_ros.twin.sensors import Instants, acceleration_of
 from omsm_ros.twin.structure import deform
 from omsm_ros.units import NANOMETRE_M
@@ -228,7 +229,7 @@ def _grid(
 
 
 @dataclass(frozen=True)
-class Cell(CheckedNumbers):
+class Cell(CheckedRecord):
     """Configuration of the twin.
 
     encoder_noise: standard deviation [m]
@@ -237,11 +238,10 @@ class Cell(CheckedNumbers):
 
     plant: Plant = field(default_factory=Plant)
     probe: Probe = field(default_factory=Probe)
-    encoder_noise: float = 0.4 * NANOMETRE_M
-    sample_period: float = 1e-3
+    encoder_noise: float = LENGTH.of_field(0.4 * NANOMETRE_M)
+    sample_period: float = SAMPLE_PERIOD.of_field(1e-3)
     seed: int = 1
     disturbances: Disturbances = field(default_factory=Disturbances)
-    positive = ("sample_period",)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

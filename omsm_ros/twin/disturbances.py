@@ -11,15 +11,16 @@ from numpy.typing import ArrayLike
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.quantities import LENGTH, CheckedRecord
 from omsm_ros.twin.machine_errors import MachineErrors
 from omsm_ros.twin.probe import Probe, ProbeErrors
-from omsm_ros.twin.record_checks import CheckedNumbers
+from omsm_ros.twin.record_checks import ANGLE, ANY, FREQUENCY, RATE
 from omsm_ros.twin.sensors import AccelerationSensor, ClockErrors, EncoderErrors, ReferenceSensor
 from omsm_ros.twin.structure import StructureErrors
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VibrationLine(CheckedNumbers):
+class VibrationLine(CheckedRecord):
     """Line ``amplitude_m · sin(2π frequency_hz t + per_turn · c + phase_rad)``.
 
     amplitude_m: half of peak to valley
@@ -27,14 +28,13 @@ class VibrationLine(CheckedNumbers):
     phase_rad: None takes a random phase
     """
 
-    amplitude_m: float
-    frequency_hz: float = 0.0
-    per_turn: float = 0.0
-    phase_rad: float | None = None
-    not_negative = ("frequency_hz",)
+    amplitude_m: float = field(metadata=LENGTH.metadata)
+    frequency_hz: float = RATE.of_field(0.0)
+    per_turn: float = ANY.of_field(0.0)
+    phase_rad: float | None = ANGLE.of_field(None)
 
     def __post_init__(self) -> None:
-        CheckedNumbers.__post_init__(self)
+        CheckedRecord.__post_init__(self)
         if not self.frequency_hz and not self.per_turn:
             raise ConfigurationError(
                 "VibrationLine: frequency_hz and per_turn are both zero; give one of them"
@@ -86,7 +86,7 @@ class Vibration:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Disturbances(CheckedNumbers):
+class Disturbances(CheckedRecord):
     """Disturbances by family; the name of each quantity ends with its unit.
 
     servo_bandwidth_hz: of Z, None for that of the plant
@@ -97,7 +97,7 @@ class Disturbances(CheckedNumbers):
     reference, accelerometer: further channels, None for none
     """
 
-    servo_bandwidth_hz: float | None = None
+    servo_bandwidth_hz: float | None = FREQUENCY.of_field(None)
     probe: ProbeErrors = field(default_factory=ProbeErrors)
     structure: StructureErrors = field(default_factory=StructureErrors)
     machine: MachineErrors = field(default_factory=MachineErrors)
@@ -106,7 +106,6 @@ class Disturbances(CheckedNumbers):
     vibration: tuple[VibrationLine, ...] = ()
     reference: ReferenceSensor | None = None
     accelerometer: AccelerationSensor | None = None
-    positive = ("servo_bandwidth_hz",)
 
 
 NOTHING = Disturbances()

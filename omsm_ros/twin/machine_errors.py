@@ -13,9 +13,19 @@ from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.kinematics.trajectories import AxisPositions
 from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.quantities import LENGTH, CheckedRecord
 from omsm_ros.twin.part import PartPose
 from omsm_ros.twin.plant import Trajectory
-from omsm_ros.twin.record_checks import CheckedNumbers
+from omsm_ros.twin.record_checks import (
+    ANGLE,
+    ANGLE_NOISE,
+    ANY,
+    DURATION,
+    FREQUENCY,
+    NOT_NEGATIVE,
+    SIZE,
+    WIDTH,
+)
 
 
 class Shift(NamedTuple):
@@ -27,7 +37,7 @@ class Shift(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Drift(CheckedNumbers):
+class Drift(CheckedRecord):
     """Drift of the height of the workpiece, zero at time 0.
 
     ramp_m_per_s: constant rate
@@ -36,14 +46,12 @@ class Drift(CheckedNumbers):
     random_walk_m_per_root_s: standard deviation after one second
     """
 
-    ramp_m_per_s: float = 0.0
-    exponential_m: float = 0.0
-    time_constant_s: float = 60.0
-    sine_m: float = 0.0
-    period_s: float = 60.0
-    random_walk_m_per_root_s: float = 0.0
-    positive = ("time_constant_s", "period_s")
-    not_negative = ("random_walk_m_per_root_s",)
+    ramp_m_per_s: float = ANY.of_field(0.0)
+    exponential_m: float = LENGTH.of_field(0.0)
+    time_constant_s: float = DURATION.of_field(60.0)
+    sine_m: float = LENGTH.of_field(0.0)
+    period_s: float = DURATION.of_field(60.0)
+    random_walk_m_per_root_s: float = NOT_NEGATIVE.of_field(0.0)
 
     def height(self, time: FloatArray, walk: Trajectory) -> FloatArray:
         """Return the height [m] at ``time`` [s]; ``walk``: random, one metre per root second."""
@@ -58,16 +66,16 @@ class Drift(CheckedNumbers):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Harmonic(CheckedNumbers):
+class Harmonic(CheckedRecord):
     """Rotating vector ``amplitude · (cos φ, sin φ)`` with ``φ = per_turn · c + phase_rad``.
 
     amplitude: in the unit of its quantity; for a single direction only the cosine counts
     per_turn: turns of the vector per turn of the spindle; negative for the opposite direction
     """
 
-    amplitude: float
+    amplitude: float = field(metadata=ANY.metadata)
     per_turn: int
-    phase_rad: float = 0.0
+    phase_rad: float = ANGLE.of_field(0.0)
 
     def vector(self, c: FloatArray) -> ComplexArray:
         """Return the vector as x + iy at spindle angle ``c`` [rad], of its shape."""
@@ -76,7 +84,7 @@ class Harmonic(CheckedNumbers):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SpindleError(CheckedNumbers):
+class SpindleError(CheckedRecord):
     """Synchronous and asynchronous error motion of the spindle (ISO 230-7).
 
     axial_m, radial_m, tilt_rad: harmonics;  tilt rotates about the origin of X and Y
@@ -87,10 +95,9 @@ class SpindleError(CheckedNumbers):
     axial_m: tuple[Harmonic, ...] = ()
     radial_m: tuple[Harmonic, ...] = ()
     tilt_rad: tuple[Harmonic, ...] = ()
-    axial_noise_m: float = 0.0
-    radial_noise_m: float = 0.0
-    tilt_noise_rad: float = 0.0
-    not_negative = ("axial_noise_m", "radial_noise_m", "tilt_noise_rad")
+    axial_noise_m: float = SIZE.of_field(0.0)
+    radial_noise_m: float = SIZE.of_field(0.0)
+    tilt_noise_rad: float = ANGLE_NOISE.of_field(0.0)
 
     @property
     def is_noisy(self) -> bool:
@@ -113,17 +120,16 @@ class SpindleError(CheckedNumbers):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Straightness(CheckedNumbers):
+class Straightness(CheckedRecord):
     """Straightness deviation of a slide over its position p.
 
     ``bow_m · (p / half_travel_m)² + periodic_m · sin(2π p / period_m)``
     """
 
-    bow_m: float = 0.0
-    half_travel_m: float = 0.1
-    periodic_m: float = 0.0
-    period_m: float = 0.01
-    positive = ("half_travel_m", "period_m")
+    bow_m: float = LENGTH.of_field(0.0)
+    half_travel_m: float = WIDTH.of_field(0.1)
+    periodic_m: float = LENGTH.of_field(0.0)
+    period_m: float = WIDTH.of_field(0.01)
 
     def deviation(self, position: FloatArray) -> FloatArray:
         """Return the error [m] at ``position`` [m], of its shape."""
@@ -132,7 +138,7 @@ class Straightness(CheckedNumbers):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MachineErrors(CheckedNumbers):
+class MachineErrors(CheckedRecord):
     """Errors of the machine; none by default.
 
     pose: of the part on the chuck;  mount: true place and direction of the probe
@@ -146,9 +152,8 @@ class MachineErrors(CheckedNumbers):
     x_slide_along_z: Straightness = field(default_factory=Straightness)
     z_slide_along_x: Straightness = field(default_factory=Straightness)
     drift: Drift = field(default_factory=Drift)
-    b_wobble_rad: float = 0.0
-    b_wobble_hz: float = 1.0
-    positive = ("b_wobble_hz",)
+    b_wobble_rad: float = ANGLE.of_field(0.0)
+    b_wobble_hz: float = FREQUENCY.of_field(1.0)
 
     def slides_shift(self, slides: AxisPositions) -> Shift:
         """Return the shift of the workpiece by straightness errors of the slides."""

@@ -1,13 +1,14 @@
 """The part on the chuck: its pose, its figure error and azimuthal ripple."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.posed import Pose
-from omsm_ros.twin.record_checks import CheckedNumbers, is_default
+from omsm_ros.quantities import LENGTH, CheckedRecord
+from omsm_ros.twin.record_checks import ANGLE, ANY, WIDTH, is_default
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
 # Each iteration reduces the error by tilt times slope, at most 1/100; it ends at the rounding of a
@@ -17,19 +18,19 @@ _SETTLED_M = 1e-13
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PartPose(CheckedNumbers):
+class PartPose(CheckedRecord):
     """Deviation of the part from its nominal pose on the chuck.
 
     x_m, y_m, z_m: shift of its origin
     tilt_x_rad, tilt_y_rad: rotation about x and about y;  clocking_rad: about the spindle
     """
 
-    x_m: float = 0.0
-    y_m: float = 0.0
-    z_m: float = 0.0
-    tilt_x_rad: float = 0.0
-    tilt_y_rad: float = 0.0
-    clocking_rad: float = 0.0
+    x_m: float = LENGTH.of_field(0.0)
+    y_m: float = LENGTH.of_field(0.0)
+    z_m: float = LENGTH.of_field(0.0)
+    tilt_x_rad: float = ANGLE.of_field(0.0)
+    tilt_y_rad: float = ANGLE.of_field(0.0)
+    clocking_rad: float = ANGLE.of_field(0.0)
 
     @property
     def rotation(self) -> FloatArray:
@@ -87,7 +88,7 @@ class UnderSpot:
 
 
 @dataclass(frozen=True, slots=True)
-class FigureError(CheckedNumbers):
+class FigureError(CheckedRecord):
     """Surface ``nominal`` with a figure error: astigmatism, trefoil, concentric ripple, tool marks.
 
     radius: of the aperture [m], where astigmatism and trefoil reach their full size
@@ -98,21 +99,20 @@ class FigureError(CheckedNumbers):
     """
 
     nominal: Surface
-    radius: float
+    radius: float = field(metadata=WIDTH.metadata)
     seed: int = 1
-    astigmatism: float = 80 * NANOMETRE_M
-    trefoil: float = 40 * NANOMETRE_M
-    ripple: float = 8 * NANOMETRE_M
-    ripple_pitch: float = 1.6 * MILLIMETRE_M
-    tool_marks: float = 0.0
-    tool_feed: float = 15 * MICROMETRE_M
-    positive = ("radius", "ripple_pitch", "tool_feed")
+    astigmatism: float = LENGTH.of_field(80 * NANOMETRE_M)
+    trefoil: float = LENGTH.of_field(40 * NANOMETRE_M)
+    ripple: float = LENGTH.of_field(8 * NANOMETRE_M)
+    ripple_pitch: float = WIDTH.of_field(1.6 * MILLIMETRE_M)
+    tool_marks: float = LENGTH.of_field(0.0)
+    tool_feed: float = WIDTH.of_field(15 * MICROMETRE_M)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m], of their broadcast shape."""
-        return self.nominal.height(x, y) + self.error(x, y)
+        return self.nominal.height(x, y) + self.deviation(x, y)
 
-    def error(self, x: FloatArray, y: FloatArray) -> FloatArray:
+    def deviation(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height above the nominal surface [m] at x, y [m], of their broadcast shape."""
         radius, angle = np.hypot(x, y), np.arctan2(y, x)
         rho = radius / self.radius
@@ -133,7 +133,7 @@ class FigureError(CheckedNumbers):
 
 
 @dataclass(frozen=True, slots=True)
-class AzimuthalRipple(CheckedNumbers):
+class AzimuthalRipple(CheckedRecord):
     """A surface: ``nominal`` plus waves across every circle about the spindle axis.
 
     wavelength: along the circle of ``radius`` [m], rounded to a whole number a turn
@@ -141,11 +141,10 @@ class AzimuthalRipple(CheckedNumbers):
     """
 
     nominal: Surface
-    radius: float
-    wavelength: float = 15 * MICROMETRE_M
-    rms: float = 11 * NANOMETRE_M
-    second: float = 0.0
-    positive = ("radius", "wavelength")
+    radius: float = field(metadata=WIDTH.metadata)
+    wavelength: float = WIDTH.of_field(15 * MICROMETRE_M)
+    rms: float = LENGTH.of_field(11 * NANOMETRE_M)
+    second: float = ANY.of_field(0.0)
 
     @property
     def count(self) -> int:

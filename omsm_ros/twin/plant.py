@@ -12,7 +12,8 @@ from omsm_ros.core.kinematics.trajectories import Motion
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.record_checks import CheckedNumbers
+from omsm_ros.quantities import CheckedRecord
+from omsm_ros.twin.record_checks import FREQUENCY
 
 # Distance from the grid, in steps, that is rounding of k · period.
 _ON_THE_GRID = 1e-7
@@ -79,15 +80,14 @@ _CHUNK_SAMPLES = 50_000
 
 
 @dataclass(frozen=True)
-class Plant(CheckedNumbers):
+class Plant(CheckedRecord):
     """Critically damped servo of ``servo_bandwidth`` [Hz] and dynamics G(s) of the probe."""
 
     dynamics: TransferFunction = PAPER_DYNAMICS
-    servo_bandwidth: float = 200.0
-    positive = ("servo_bandwidth",)
+    servo_bandwidth: float = FREQUENCY.of_field(200.0)
 
     def __post_init__(self) -> None:
-        CheckedNumbers.__post_init__(self)
+        CheckedRecord.__post_init__(self)
         if not self.dynamics.is_stable:
             raise ConfigurationError(f"plant with poles {self.dynamics.poles()!r} is unstable")
 

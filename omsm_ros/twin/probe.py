@@ -9,8 +9,9 @@ import numpy as np
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences, workpiece_xy
 from omsm_ros.core.streams.blocks import DistanceBlock, FloatArray, Status
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.quantities import COUNT, LENGTH, PROBABILITY, CheckedRecord
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN
-from omsm_ros.twin.record_checks import LONGEST_LAG_S, CheckedNumbers
+from omsm_ros.twin.record_checks import ANY, LAG, SIZE, SLOPE_LIMIT, WIDTH
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
 # Gauss-Legendre nodes of an exposure: within 1e-5 of the mean where up to 1.2 waves pass in it,
@@ -39,7 +40,7 @@ class Probe:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ProbeErrors(CheckedNumbers):
+class ProbeErrors(CheckedRecord):
     """Errors of timing, distance and light; none by default.
 
     spot_m: diameter of the spot, a disc over which the height of the part is averaged
@@ -55,33 +56,26 @@ class ProbeErrors(CheckedNumbers):
     dropout_probability: probability of a random dropout [1]
     """
 
-    spot_m: float = 0.0
-    latency_s: float = 0.0
-    exposure_s: float = 0.0
-    averages: int = 1
-    noise_m: float = 0.0
-    cubic_m: float = 0.0
-    periodic_m: float = 0.0
-    period_m: float = 10 * MICROMETRE_M
-    slope_error_m_per_rad: float = 0.0
-    slope_error_m_per_rad2: float = 0.0
-    intensity_slope_rad: float | None = None
-    dropout_slope_rad: float | None = None
-    dropout_probability: float = 0.0
-    positive = ("period_m", "intensity_slope_rad", "dropout_slope_rad")
-    not_negative = ("spot_m", "latency_s", "exposure_s", "noise_m", "dropout_probability")
-    lags = ("latency_s", "exposure_s")
+    spot_m: float = SIZE.of_field(0.0)
+    latency_s: float = LAG.of_field(0.0)
+    exposure_s: float = LAG.of_field(0.0)
+    averages: int = COUNT.of_field(1)
+    noise_m: float = SIZE.of_field(0.0)
+    cubic_m: float = LENGTH.of_field(0.0)
+    periodic_m: float = LENGTH.of_field(0.0)
+    period_m: float = WIDTH.of_field(10 * MICROMETRE_M)
+    slope_error_m_per_rad: float = ANY.of_field(0.0)
+    slope_error_m_per_rad2: float = ANY.of_field(0.0)
+    intensity_slope_rad: float | None = SLOPE_LIMIT.of_field(None)
+    dropout_slope_rad: float | None = SLOPE_LIMIT.of_field(None)
+    dropout_probability: float = PROBABILITY.of_field(0.0)
 
     def __post_init__(self) -> None:
-        CheckedNumbers.__post_init__(self)
-        if self.averages < 1 or self.window_s > LONGEST_LAG_S:
+        CheckedRecord.__post_init__(self)
+        if self.window_s > LAG.high:
             raise ConfigurationError(
-                f"ProbeErrors: averages is {self.averages!r}, exposure_s {self.exposure_s!r}; "
-                f"expected 1 or more, and {LONGEST_LAG_S:g} s at most together"
-            )
-        if self.dropout_probability > 1:
-            raise ConfigurationError(
-                f"ProbeErrors: dropout_probability is {self.dropout_probability!r}, expected 0 to 1"
+                f"exposure_s is {self.exposure_s!r} and averages {self.averages!r}; expected "
+                f"{LAG.high:g} s at most together"
             )
 
     @property

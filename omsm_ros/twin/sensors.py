@@ -5,7 +5,7 @@ computer. Not imitated for encoders: errors of X, Y, B and C, count loss, bendin
 of a counter are faults of the emulators.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -13,19 +13,30 @@ from scipy import signal
 
 from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import AccelerationBlock, DistanceBlock, FloatArray, Status
-from omsm_ros.errors import ConfigurationError
+from omsm_ros.quantities import LENGTH, CheckedRecord
 from omsm_ros.twin.plant import Trajectory
-from omsm_ros.twin.record_checks import CheckedNumbers, is_default
+from omsm_ros.twin.record_checks import (
+    ANGLE,
+    ANY,
+    DAMPING,
+    FREQUENCY,
+    LAG,
+    NOT_NEGATIVE,
+    OFFSET,
+    PARTS_PER_MILLION,
+    SENSOR_PERIOD,
+    SIZE,
+    WIDTH,
+    is_default,
+)
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M, PPM
 
-# Accelerometers measure up to 100 kHz.
-_SHORTEST_PERIOD_S = 5e-6
 # One of 10⁹ draws of a normal distribution lies beyond 6.1 σ.
 _JITTER_LIMIT = 7.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ReferenceSensor(CheckedNumbers):
+class ReferenceSensor(CheckedRecord):
     """Capacitive sensor on the motion of the slide, as a CPL190 (250 µm).
 
     latency_s: of the reading;  scale_ppm: relative error, positive for a long reading
@@ -33,14 +44,11 @@ class ReferenceSensor(CheckedNumbers):
     cubic_m: linearity error at the end of its range
     """
 
-    latency_s: float = 0.0
-    scale_ppm: float = 0.0
-    noise_m: float = 2 * NANOMETRE_M
-    half_range_m: float = 125 * MICROMETRE_M
-    cubic_m: float = 0.0
-    positive = ("half_range_m",)
-    not_negative = ("latency_s", "noise_m")
-    lags = ("latency_s",)
+    latency_s: float = LAG.of_field(0.0)
+    scale_ppm: float = PARTS_PER_MILLION.of_field(0.0)
+    noise_m: float = SIZE.of_field(2 * NANOMETRE_M)
+    half_range_m: float = WIDTH.of_field(125 * MICROMETRE_M)
+    cubic_m: float = LENGTH.of_field(0.0)
 
     def read(
         self, slide: Trajectory, time: FloatArray, period: float, random: np.random.Generator
@@ -60,7 +68,7 @@ class ReferenceSensor(CheckedNumbers):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AccelerationSensor(CheckedNumbers):
+class AccelerationSensor(CheckedRecord):
     """Piezoelectric accelerometer on the probe, as a PCB 356A17.
 
     sample_period_s: of the sensor, None for that of the trigger
@@ -69,21 +77,11 @@ class AccelerationSensor(CheckedNumbers):
     cross_talk: share of z in x and y [1]
     """
 
-    sample_period_s: float | None = None
-    noise_m_per_s2: float = 6e-4
-    high_pass_hz: float = 0.5
-    scale_ppm: float = 0.0
-    cross_talk: float = 0.0
-    positive = ("sample_period_s", "high_pass_hz")
-    not_negative = ("noise_m_per_s2",)
-
-    def __post_init__(self) -> None:
-        CheckedNumbers.__post_init__(self)
-        if self.sample_period_s is not None and self.sample_period_s < _SHORTEST_PERIOD_S:
-            raise ConfigurationError(
-                f"AccelerationSensor: sample_period_s is {self.sample_period_s!r}, expected "
-                f"{_SHORTEST_PERIOD_S:g} or more"
-            )
+    sample_period_s: float | None = SENSOR_PERIOD.of_field(None)
+    noise_m_per_s2: float = NOT_NEGATIVE.of_field(6e-4)
+    high_pass_hz: float = FREQUENCY.of_field(0.5)
+    scale_ppm: float = PARTS_PER_MILLION.of_field(0.0)
+    cross_talk: float = ANY.of_field(0.0)
 
     def read(
         self, acceleration: FloatArray, period: float, random: np.random.Generator
@@ -122,7 +120,7 @@ class Instants(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ClockErrors(CheckedNumbers):
+class ClockErrors(CheckedRecord):
     """Deviations of the sampling instants from the trigger count; none by default.
 
     trigger_jitter_s: rms of all devices in common;  probe_jitter_s: rms of the probe alone
@@ -131,14 +129,12 @@ class ClockErrors(CheckedNumbers):
     z_latch_late_s, c_latch_late_s: delay of the latch of the encoder after the trigger
     """
 
-    trigger_jitter_s: float = 0.0
-    probe_jitter_s: float = 0.0
-    probe_offset_s: float = 0.0
-    probe_drift_ppm: float = 0.0
-    z_latch_late_s: float = 0.0
-    c_latch_late_s: float = 0.0
-    not_negative = ("trigger_jitter_s", "probe_jitter_s")
-    lags = (*not_negative, "probe_offset_s", "z_latch_late_s", "c_latch_late_s")
+    trigger_jitter_s: float = LAG.of_field(0.0)
+    probe_jitter_s: float = LAG.of_field(0.0)
+    probe_offset_s: float = OFFSET.of_field(0.0)
+    probe_drift_ppm: float = PARTS_PER_MILLION.of_field(0.0)
+    z_latch_late_s: float = OFFSET.of_field(0.0)
+    c_latch_late_s: float = OFFSET.of_field(0.0)
 
     @property
     def lag_s(self) -> float:
@@ -167,7 +163,7 @@ class ClockErrors(CheckedNumbers):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Pitch(CheckedNumbers):
+class Pitch(CheckedRecord):
     """Pitch α of the slide, by which the encoder measures ``E = L α`` in addition (Abbe error).
 
     arm_m: L, offset of the encoder from the line of the probe
@@ -175,14 +171,13 @@ class Pitch(CheckedNumbers):
     rad_per_m_s2: pitch under acceleration, through a mode of frequency_hz and damping_ratio
     """
 
-    arm_m: float
-    rad_per_m: float = 0.0
-    periodic_rad: float = 0.0
-    period_m: float = 1e-3
-    rad_per_m_s2: float = 0.0
-    frequency_hz: float = 60.0
-    damping_ratio: float = 0.05
-    positive = ("period_m", "frequency_hz", "damping_ratio")
+    arm_m: float = field(metadata=LENGTH.metadata)
+    rad_per_m: float = ANY.of_field(0.0)
+    periodic_rad: float = ANGLE.of_field(0.0)
+    period_m: float = WIDTH.of_field(1e-3)
+    rad_per_m_s2: float = ANY.of_field(0.0)
+    frequency_hz: float = FREQUENCY.of_field(60.0)
+    damping_ratio: float = DAMPING.of_field(0.05)
 
     @property
     def _mode(self) -> tuple[list[float], list[float]]:
@@ -207,7 +202,7 @@ class Pitch(CheckedNumbers):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EncoderErrors(CheckedNumbers):
+class EncoderErrors(CheckedRecord):
     """Errors of the encoder of Z; none by default.
 
     scale_ppm: relative error, positive for a long reading
@@ -216,13 +211,11 @@ class EncoderErrors(CheckedNumbers):
     pitch: of the slide, by which the encoder measures another motion than that of the probe
     """
 
-    scale_ppm: float = 0.0
-    interpolation_m: float = 0.0
-    signal_period_m: float = 4e-6
-    resolution_m: float = 0.0
+    scale_ppm: float = PARTS_PER_MILLION.of_field(0.0)
+    interpolation_m: float = LENGTH.of_field(0.0)
+    signal_period_m: float = WIDTH.of_field(4e-6)
+    resolution_m: float = SIZE.of_field(0.0)
     pitch: Pitch | None = None
-    positive = ("signal_period_m",)
-    not_negative = ("resolution_m",)
 
     def seen(self, slide: Trajectory) -> Trajectory:
         """Return the position under the encoder [m], without errors of the encoder itself."""

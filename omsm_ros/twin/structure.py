@@ -7,7 +7,7 @@ imitated: backlash and friction within the servo loop, stiffness that changes th
 mode (it scales the whole deflection), temperature.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import signal
@@ -17,8 +17,9 @@ from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.model_errors.families import dahl_friction, through_backlash
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.quantities import LENGTH, CheckedRecord
 from omsm_ros.twin.plant import Movement, Trajectory
-from omsm_ros.twin.record_checks import CheckedNumbers, is_default
+from omsm_ros.twin.record_checks import ANY, DAMPING, DURATION, FREQUENCY, SIZE, WIDTH, is_default
 
 # Time in which the motion is faded in, so that it does not excite a soft mode.
 _SPIN_UP_S = 4.0
@@ -54,31 +55,29 @@ def backlash(driver: Trajectory, width: float) -> BacklashOutput:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Creep(CheckedNumbers):
+class Creep(CheckedRecord):
     """Creep of a share of each move: ``1 - ε + ε / (1 + sτ)``.
 
     fraction: ε of the move [1];  time_constant_s: τ
     """
 
-    fraction: float
-    time_constant_s: float
-    positive = ("time_constant_s",)
+    fraction: float = field(metadata=ANY.metadata)
+    time_constant_s: float = field(metadata=DURATION.metadata)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LogCreep(CheckedNumbers):
+class LogCreep(CheckedRecord):
     """Creep proportional to the logarithm of time, as of piezos and grease.
 
     fraction_per_decade: of the move, in each decade from shortest_s to longest_s [1]
     """
 
-    fraction_per_decade: float
-    shortest_s: float = 0.01
-    longest_s: float = 1000.0
-    positive = ("shortest_s", "longest_s")
+    fraction_per_decade: float = field(metadata=ANY.metadata)
+    shortest_s: float = DURATION.of_field(0.01)
+    longest_s: float = DURATION.of_field(1000.0)
 
     def __post_init__(self) -> None:
-        CheckedNumbers.__post_init__(self)
+        CheckedRecord.__post_init__(self)
         if not _SHORTEST_RELAXATION_S <= self.shortest_s <= self.longest_s:
             raise ConfigurationError(
                 f"LogCreep: from {self.shortest_s!r} to {self.longest_s!r} s, expected to begin at "
@@ -96,16 +95,15 @@ class LogCreep(CheckedNumbers):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SoftMode(CheckedNumbers):
+class SoftMode(CheckedRecord):
     """Weak mode of base or isolator: ``1 - p + p ω² / (s² + 2ζω s + ω²)``.
 
     participation: p, static share of the motion [1]
     """
 
-    frequency_hz: float
-    damping_ratio: float
-    participation: float
-    positive = ("frequency_hz", "damping_ratio")
+    frequency_hz: float = field(metadata=FREQUENCY.metadata)
+    damping_ratio: float = field(metadata=DAMPING.metadata)
+    participation: float = field(metadata=ANY.metadata)
 
     @property
     def omega(self) -> float:
@@ -114,19 +112,18 @@ class SoftMode(CheckedNumbers):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Friction(CheckedNumbers):
+class Friction(CheckedRecord):
     """Pre-sliding friction (Dahl 1968) that retards the probe by up to ``drag_m``.
 
     dF/dz = (1 - F sgn ż) / presliding_m, F from -1 to 1
     """
 
-    drag_m: float
-    presliding_m: float
-    positive = ("presliding_m",)
+    drag_m: float = field(metadata=LENGTH.metadata)
+    presliding_m: float = field(metadata=WIDTH.metadata)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StructureErrors(CheckedNumbers):
+class StructureErrors(CheckedRecord):
     """Errors between slide and probe; none by default.
 
     creep, log_creep, soft_modes: linear, slow
@@ -140,13 +137,11 @@ class StructureErrors(CheckedNumbers):
     creep: tuple[Creep, ...] = ()
     log_creep: LogCreep | None = None
     soft_modes: tuple[SoftMode, ...] = ()
-    compliance_per_m_of_z: float = 0.0
-    compliance_per_m_of_x: float = 0.0
-    hardening_deflection_m: float | None = None
-    backlash_m: float = 0.0
+    compliance_per_m_of_z: float = ANY.of_field(0.0)
+    compliance_per_m_of_x: float = ANY.of_field(0.0)
+    hardening_deflection_m: float | None = WIDTH.of_field(None)
+    backlash_m: float = SIZE.of_field(0.0)
     friction: Friction | None = None
-    positive = ("hardening_deflection_m",)
-    not_negative = ("backlash_m",)
 
     @property
     def relaxations(self) -> tuple[Creep, ...]:

@@ -191,11 +191,11 @@ def test_the_twin_is_made_as_its_options_say(capsys, monkeypatch, tmp_path):
     assert (scenario.start_radius, scenario.seed, plain.seed) == (1e-3, 7, 7)
     # Two scans of one part; without --part the seed is that of the part, too.
     r = np.linspace(0, 2e-3, 50)
-    error = scenario.part.error(r, r)
+    error = scenario.part.deviation(r, r)
     assert np.ptp(error) > 0
-    other = type(scenario)(seed=99, part_seed=3).part.error(r, r)
+    other = type(scenario)(seed=99, part_seed=3).part.deviation(r, r)
     np.testing.assert_array_equal(error, other)
-    assert not np.allclose(plain.part.error(r, r), error, atol=1e-12)
+    assert not np.allclose(plain.part.deviation(r, r), error, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -276,10 +276,10 @@ def test_no_draw_of_a_clock_lies_beyond_its_reach():
 @pytest.mark.parametrize(
     ("given", "named"),
     [
-        ({"probe_offset_s": 2.0}, "probe_offset_s is 2.0, expected a number from -1 to 1"),
-        ({"probe_jitter_s": -1e-9}, "probe_jitter_s is -1e-09, expected a number from 0"),
+        ({"probe_offset_s": 2.0}, "probe_offset_s is 2.0 s, expected a number from -1 to 1 s"),
+        ({"probe_jitter_s": -1e-9}, "probe_jitter_s is -1e-09 s, expected a number from 0"),
         ({"probe_drift_ppm": float("nan")}, "probe_drift_ppm is nan"),
-        ({"probe_drift_ppm": 1e6}, "from -100000 to 100000; check its unit"),
+        ({"probe_drift_ppm": 1e6}, r"from -100000 to 100000 ppm; check its unit"),
     ],
 )
 def test_a_number_beyond_every_machine_is_named_with_its_limits(given, named):
@@ -293,7 +293,7 @@ def test_a_record_is_its_default_until_something_is_set():
     assert PartPose(x_m=-9.9).x_m == -9.9
     with pytest.raises(ConfigurationError, match=r"x_m is 10\.1"):
         PartPose(x_m=10.1)
-    with pytest.raises(ConfigurationError, match="positive number"):
+    with pytest.raises(ConfigurationError, match="frequency_hz is 0"):
         SoftMode(frequency_hz=0.0, damping_ratio=0.1, participation=0.1)
 
 

@@ -113,7 +113,7 @@ def test_what_sees_no_slope_says_so():
         ({"averages": 0}, "averages"),
         ({"averages": 20, "exposure_s": 0.1}, "1 s at most together"),
         ({"latency_s": 1e9}, "latency_s"),
-        ({"periodic_m": 20.0}, "check its unit"),
+        ({"periodic_m": 20.0}, "give it in metres"),
         ({"dropout_probability": 1.5}, "dropout_probability"),
         ({"intensity_slope_rad": 0.0}, "intensity_slope_rad"),
         ({"cubic_m": np.nan}, "cubic_m"),
