@@ -1,6 +1,7 @@
 """Parts of a step test that contradict each other, made to do so by known amounts."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -110,7 +111,7 @@ def test_the_band_holds_the_difference():
     compared, dynamics = contrasts(diagnostics), diagnostics.fitted.dynamics
     covariance = contrast_covariance(compared, dynamics)
     assert low_frequency_delay_uncertainty(dynamics, covariance) >= 19e-6
-    (said,) = consistency(compared)
+    (said,) = consistency(SimpleNamespace(contrasts=compared))
     assert said.severity == RESERVATION
     assert "small steps and large differ by" in str(said)
     assert "by chance" in str(said)
@@ -121,7 +122,7 @@ def test_a_clean_test_is_neither_widened_nor_reserved():
     compared = contrasts(diagnostics)
     assert {contrast.parts for contrast in compared} == EVERY
     assert not np.any(contrast_covariance(compared, diagnostics.fitted.dynamics))
-    assert not list(consistency(compared))
+    assert not list(consistency(SimpleNamespace(contrasts=compared)))
 
 
 def test_the_certificate_states_every_comparison():

@@ -1,6 +1,7 @@
 """Model errors of a step test: columns against closed forms, and findings against the truth."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.calibration.certificate import REJECTS
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.estimation.preparation import prepare
-from omsm_ros.core.identification.checks import agreement, dynamic_gain_finding, independence
+from omsm_ros.core.identification.checks import agreement, dynamic_gain, independence
 from omsm_ros.core.identification.covariance_terms import reference_lag
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
@@ -291,9 +292,17 @@ class TestUndetectedTerms:
         assert fitted_relaxation(dynamics) == pytest.approx(size, rel=1e-2)
 
 
+def follows(p):
+    """Evidence of a residual that follows the motion by chance with probability ``p``."""
+    return SimpleNamespace(
+        searched=SimpleNamespace(diagnostics=SimpleNamespace(independence=p)),
+        residual=SimpleNamespace(timing=0.0, axis_timing=0.0),
+    )
+
+
 def test_a_residual_that_follows_the_motion_rejects():
-    assert [finding.severity for finding in independence(1e-5)] == [REJECTS]
-    assert not list(independence(1e-3))
+    assert [finding.severity for finding in independence(follows(1e-5))] == [REJECTS]
+    assert not list(independence(follows(1e-3)))
 
 
 def stepped(delay):
@@ -306,8 +315,12 @@ def test_a_response_that_the_data_contradict_without_a_model_rejects():
     problem = stepped(0.5e-3)
     right = fit(problem, Structure(0, 0, True), [np.array([0.1])])
     wrong = fit(problem, Structure(0, 0, False), [np.empty(0)])
-    assert not list(agreement(response_difference(problem, right, 50.0)))
-    (finding,) = agreement(response_difference(problem, wrong, 50.0))
+    assert not list(
+        agreement(SimpleNamespace(response_difference=response_difference(problem, right, 50.0)))
+    )
+    (finding,) = agreement(
+        SimpleNamespace(response_difference=response_difference(problem, wrong, 50.0))
+    )
     assert finding.severity == REJECTS
 
 
@@ -345,9 +358,18 @@ def test_a_reference_on_time_is_accepted():
     assert abs(certificate.response.reference_lag_s) < 1e-6
 
 
+def creeps(uncertainty):
+    """Evidence of a gain that a relaxation of 5 s leaves uncertain, edges every 0.5 s."""
+    return SimpleNamespace(
+        undetected=SimpleNamespace(gain_u=uncertainty, plateau_needed_s=5.0),
+        searched=SimpleNamespace(diagnostics=SimpleNamespace(plateau=0.5)),
+        limits=SimpleNamespace(gain=5e-3),
+    )
+
+
 def test_a_gain_that_drift_leaves_open_rejects_with_the_plateau_that_would_tell():
-    assert not list(dynamic_gain_finding(1e-4, 5.0, 0.5, 5e-3))
-    (reason,) = dynamic_gain_finding(1e-2, 5.0, 0.5, 5e-3)
+    assert not list(dynamic_gain(creeps(1e-4)))
+    (reason,) = dynamic_gain(creeps(1e-2))
     assert reason.severity == REJECTS
     assert "by 2.0 %" in str(reason)
     assert "rest 5.0 s on each plateau" in str(reason)

@@ -6,10 +6,8 @@ from scipy import signal
 from soaked import soaked
 
 from benchmarks.recorded import record_from_arrays
-from omsm_ros.core.calibration.certificate import REJECTS
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.preparation import prepare
-from omsm_ros.core.identification.checks import lead
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.errors import ConfigurationError, IdentificationError
@@ -54,23 +52,6 @@ def test_exchanged_channels_are_named():
     certificate = identify(record_from_arrays(PERIOD, seen, -z)).calibration.certificate
     assert certificate.verdict == "rejected"
     assert any("channels are exchanged" in reason for reason in map(str, certificate.reasons))
-
-
-@pytest.mark.parametrize(
-    ("lag", "uncertainty", "noises", "reported"),
-    [
-        (0.3e-3, 1e-6, (1e-9, 1e-8), ""),
-        (-3e-6, 1e-7, (1e-9, 1e-8), ""),
-        (-30e-6, 1e-5, (1e-9, 1e-8), ""),
-        (-30e-6, 1e-6, (1e-9, 1e-8), "the encoder is read late"),
-        (-30e-6, 1e-6, (1e-8, 1e-9), "channels are exchanged"),
-    ],
-)
-def test_a_probe_that_leads(lag, uncertainty, noises, reported):
-    found = list(lead(lag, uncertainty, *noises, harmless=7e-6))
-    assert reported in " ".join(map(str, found))
-    assert len(found) == bool(reported)
-    assert [f.severity == REJECTS for f in found] == [("exchanged" in reported)] * len(found)
 
 
 @pytest.mark.soak
