@@ -34,10 +34,11 @@ def check_dynamics(dynamics: TransferFunction, sample_period: float) -> None:
         raise CalibrationError("calibration.dc_gain", gain=dynamics.dc_gain)
     DELAY.checked(dynamics.delay, CalibrationError)
     _check_samples("delay", dynamics.delay, sample_period, MAX_DELAY_SAMPLES)
-    poles = checked_roots(dynamics, "poles")
-    for roots in (poles, checked_roots(dynamics, "zeros")):
-        for rate in abs(roots):
-            TIME_CONSTANT.checked(_inverse(rate), CalibrationError, "time constant of G_m")
+    poles, zeros = checked_roots(dynamics, "poles"), checked_roots(dynamics, "zeros")
+    # A zero may be as good as infinite: its coefficient is nothing then.
+    ends = [max(_inverse(rate), TIME_CONSTANT.low) for rate in abs(zeros)]
+    for time in [*ends, *(_inverse(rate) for rate in abs(poles))]:
+        TIME_CONSTANT.checked(time, CalibrationError, "time constant of G_m")
     if len(poles):
         slowest = _inverse(np.min(abs(poles.real)))
         TIME_CONSTANT.checked(slowest, CalibrationError, "slowest decay of G_m")

@@ -41,8 +41,6 @@ MAX_POLES = 20
 _LEAST_PARAMETERS = 3
 # Least damping ratio of a pole beyond half the sampling rate, where no sample shows it.
 _DAMPED_BEYOND = 0.1
-# Radians a sample, thirty times half the sampling rate: a faster pole acts as a constant.
-_UNOBSERVABLE = 100.0
 # Relative distance of a zero from a pole below which no data distinguish them.
 _CANCELLING = 0.005
 
@@ -157,9 +155,7 @@ def identifiable(dynamics: TransferFunction, period: float, duration: float) -> 
     poles = dynamics.poles()
     rate, decay = np.abs(poles), -poles.real
     lasting = decay * duration < 1
-    turned = rate * period
-    beyond = (np.pi < turned) & (turned < _UNOBSERVABLE)
-    ringing = beyond & (decay < _DAMPED_BEYOND * rate)
+    ringing = (np.pi < rate * period) & (decay < _DAMPED_BEYOND * rate)
     return not bool(np.any(lasting | ringing))
 
 

@@ -79,6 +79,8 @@ _BLOCK = 32
 _RACE_EVALUATIONS = 5
 # Most iterations from the best start: it bounds fits along a flat valley, others converge.
 _FINISH_EVALUATIONS = 60
+# Radians a sample, thirty times half the sampling rate: a faster pole would be no other model.
+_FASTEST = 100.0
 # Exponent of e to which the pulse before a record has decayed where its band ends.
 _PULSE_END = 14.0
 
@@ -189,6 +191,14 @@ class Problem:
         powers = self.s ** np.arange(fitted.structure.poles)[:, np.newaxis]
         every = np.concatenate([powers * (lag * pulse) for pulse in self._pulses])
         return np.asarray(fft.irfft(every, self.closed_length)[:, : len(self.input)].T)
+
+    def box(self, scaled: ScaledStructure) -> tuple[FloatArray, FloatArray]:
+        """Return the bounds of ψ: no pole is faster than the samples can show."""
+        lower, upper = scaled.bounds()
+        poles, pairs = scaled.structure.poles, scaled.structure.pairs
+        fastest = np.log(self.rate * self.period / _FASTEST)
+        lower[: poles - pairs], lower[poles - pairs : poles] = fastest, 2 * fastest
+        return lower, upper
 
     @cached_property
     def _target(self) -> FloatArray:
@@ -386,7 +396,7 @@ def fit(
     budget: counts the evaluations, if given
     """
     scaled = ScaledStructure(structure, problem.rate)
-    box = scaled.bounds()
+    box = problem.box(scaled)
 
     def project(nonlinear: FloatArray) -> Projection:
         if budget is not None:

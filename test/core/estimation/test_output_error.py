@@ -131,3 +131,13 @@ def test_a_response_bends_by_gain_lag_and_curvature():
         low_order_sensitivity = moved * (2j * np.pi * frequency / RATE) ** power
         expected = np.fft.irfft(low_order_sensitivity, len(closed))[: len(problem.input)]
         np.testing.assert_allclose(columns[:, power], expected, atol=1e-9 * np.ptp(expected))
+
+
+@pytest.mark.parametrize("poles", [1, 2])
+def test_no_fitted_pole_is_faster_than_the_samples_can_show(poles):
+    """Poles that an answer at once does not need would go to where a corrector refuses them."""
+    problem = problem_of(TransferFunction(np.ones(1), np.ones(1)), noise=1e-12)
+    structure = Structure(poles, 0, False)
+    found = fit(problem, structure, [start(structure, [-1.0] * poles)])
+    rates = np.abs(found.dynamics.poles()) * PERIOD
+    assert np.max(rates) < 101  # two that coincide are apart by the root of the rounding

@@ -190,11 +190,9 @@ class TestOtherPlants:
 
 
 @pytest.mark.parametrize("order", [6, *soaked(3, 4, 5, 8, 12)])
-def test_an_accepted_order_can_be_read_back_and_corrected_with(order):
-    """More poles than the motion determines leave one that is too slow for any filter."""
+def test_an_accepted_order_can_be_read_back(order):
+    """More poles than the motion determines are still poles that a filter can have."""
     calibration = identify(record_once(1, plant=Plant()), order=order).calibration
     if calibration.certificate.verdict != REJECTED:
-        assert Calibration.from_content(calibration.content()).dynamics == calibration.dynamics
-    elif order == 6:
-        (reason,) = map(str, calibration.certificate.reasons)
-        assert "a model of order 6 cannot correct (slowest decay of G_m is" in reason
+        read = Calibration.from_content(calibration.content()).dynamics
+        np.testing.assert_array_equal(read.denominator, calibration.dynamics.denominator)

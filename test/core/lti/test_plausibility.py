@@ -66,6 +66,16 @@ def test_dynamics_of_no_machine_are_refused_by_name(
         changed(dynamics=TransferFunction(numerator, denominator, delay))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("coefficient", [3e-14, -3e-16, 1e-30])
+def test_a_zero_that_is_as_good_as_infinite_is_taken(coefficient: float) -> None:
+    denominator = [1.0, 1e-3, 1e-6]
+    known = changed(dynamics=TransferFunction([1.0, coefficient], denominator))  # type: ignore[arg-type]
+    without = TransferFunction([1.0], denominator)  # type: ignore[arg-type]
+    lines = np.geomspace(0.1, 400.0, 20)
+    digital, plain = (discretise(g, GOOD.sample_period) for g in (known.dynamics, without))
+    np.testing.assert_allclose(digital.response(lines), plain.response(lines), rtol=1e-9)
+
+
 def test_a_delay_of_many_samples_is_refused_for_its_filter() -> None:
     late = TransferFunction([1.0], [1.0], 0.5)
     none = np.zeros((2, 2))
