@@ -229,8 +229,9 @@ def correct_errors_in_variables(
     """
     if problem.noise <= 0 or problem.errors_in_variables is not None:
         return None
-    # Readings that change by one step agree with a constant.
-    reach = max(problem.noise, 0.5 * float(np.sqrt(12 * problem.input_error)))
+    # Readings that change by one step agree with a constant. No mean reduces what they share.
+    rounding = max(problem.input_error - problem.input_shared, 0.0)
+    reach = max(problem.noise, 0.5 * float(np.sqrt(12 * rounding)))
     smooth, left = smoothed(problem.input, reach, edges)
     noise = problem.input - smooth
     # Unfiltered: the readings have noise at all frequencies.

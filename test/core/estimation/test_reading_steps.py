@@ -1,15 +1,25 @@
 """Test the variance of the rounding error that all readings of a plateau share."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from soaked import soaked
 
 from benchmarks.recorded import record_from_arrays
-from omsm_ros.core.estimation.noise import plateau_variance, plateaus, reading_step
+from omsm_ros.core.estimation.noise import (
+    correct_errors_in_variables,
+    plateau_variance,
+    plateaus,
+    reading_step,
+)
+from omsm_ros.core.estimation.output_error import fit
+from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.estimation.steps import find_steps
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
+from omsm_ros.core.lti.transfer_function import Structure
 
 PERIOD, STEP_M, LAG_S = 1e-3, 50e-9, 0.34e-3
 RNG = np.random.default_rng(5)
@@ -80,3 +90,19 @@ def test_coarse_readings_are_accepted_with_a_band_that_holds_the_truth(seed):
     assert np.all(off < 3 * np.hypot(band.gain, band.phase))
     # The noise of readings that hardly change is that of rounding, not of the rests.
     assert found.certificate.residual.noise_m > 0.5 * STEP_M / np.sqrt(12)
+
+
+def test_readings_of_an_axis_that_never_change_on_a_plateau_are_not_averaged():
+    """Where they do change, at the first counts of an edge, it moves."""
+    test, rng, count = StepTest(), np.random.default_rng(3), 10e-9
+    time = np.arange(0.0, test.duration, PERIOD)
+    jitter = rng.normal(0, 0.05 * count, len(time))
+    z = np.round((1.0204 * test.positions(time).z + jitter) / count + 0.1) * count
+    seen = test.positions(time - LAG_S).z + rng.normal(0, 10e-9, len(time))
+    prepared = prepare(record_from_arrays(PERIOD, z, -seen), "encoder")
+    problem = replace(prepared.problem, noise=0.05 * count)
+    assert problem.input_shared > 0.9 * count**2 / 12
+    lag = fit(problem, Structure(1, 0, False), [np.zeros(1)])
+    found = correct_errors_in_variables(problem, lag, prepared.steps.edges)
+    moved = 0.0 if found is None else np.max(np.abs(found.input - problem.input))
+    assert moved < 0.3 * count
