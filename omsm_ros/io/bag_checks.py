@@ -26,7 +26,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from omsm_ros.errors import BagError
-from omsm_ros.io.files import library_errors, open_regular
+from omsm_ros.io.files import library_errors, open_regular, read_text
 from omsm_ros.io.json_and_yaml import has_aliases
 from omsm_ros.quantities import shown
 
@@ -85,16 +85,9 @@ def check_files(path: Path) -> None:
 
 def _check_metadata(path: Path) -> None:
     """Raise BagError for a description of a folder that is too long, or not plain YAML."""
-    if not path.is_file():
-        return
-    with open_regular(path, BagError, "bag") as stream:
-        text = stream.read(_MAX_METADATA_BYTES + 1)
-    if len(text) > _MAX_METADATA_BYTES:
-        raise BagError(
-            f"bag {str(path.parent)!r} has metadata of more than {_MAX_METADATA_BYTES} "
-            "bytes; record it again, in fewer files"
-        )
-    if has_aliases(text):
+    if path.is_file() and has_aliases(
+        read_text(path, _MAX_METADATA_BYTES, BagError, "description of a bag")
+    ):
         raise BagError(
             f"bag {str(path.parent)!r} has aliases or anchors in its metadata.yaml, which rosbag2 "
             "never writes; make it anew with 'ros2 bag reindex'"
@@ -104,7 +97,7 @@ def _check_metadata(path: Path) -> None:
 def _plain_qos(described: Any) -> list[Qos]:
     """Return the quality of service that a bag states of a topic; ReaderError if it has aliases."""
     text = described if isinstance(described, str) else ""
-    if len(text) > _LONGEST_QOS or has_aliases(text.encode("utf-8", "replace")):
+    if len(text) > _LONGEST_QOS or has_aliases(text):
         raise ReaderError("a topic states its quality of service in no way that rosbag2 does")
     return list(parse_qos(described))
 

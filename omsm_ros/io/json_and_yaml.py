@@ -191,9 +191,9 @@ def mapping_of(text: str, error: type[OmsmError], what: str) -> dict[str, Any]:
     return content
 
 
-def has_aliases(text: bytes) -> bool:
+def has_aliases(text: str) -> bool:
     """Return whether a YAML text has aliases or anchors; one that is no YAML has none."""
-    if b"&" not in text and b"*" not in text:
+    if "&" not in text and "*" not in text:
         return False
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # much faster, if available
     try:

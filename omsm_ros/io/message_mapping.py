@@ -27,7 +27,7 @@ from omsm_ros.core.streams.blocks import AccelerationBlock, AxisBlock, Block, Di
 from omsm_ros.errors import BagError, CalibrationError, DataError
 from omsm_ros.io import json_and_yaml
 from omsm_ros.io.calibration_file import calibration_from, calibration_of
-from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
+from omsm_ros.io.json_and_yaml import NUMBER, check_form, form, or_none
 from omsm_ros.quantities import TEMPERATURE
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -252,27 +252,22 @@ def cloud_message(
 
 MAX_CHARACTERS = 100_000
 _MOST_BANDS = 100
-_LEVEL: Mapping[str, Any] = {"type": "number", "minimum": 0}
-_LEVELS: Mapping[str, Any] = {"type": "array", "items": _LEVEL, "maxItems": _MOST_BANDS}
-_BAND: Mapping[str, Any] = {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 2}
+_LEVEL: dict[str, Any] = {"type": "number", "minimum": 0}
+_LEVELS = {"type": "array", "items": _LEVEL, "maxItems": _MOST_BANDS}
+_BAND = {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 2}
+_LINE = {"frequency": _LEVEL, "amplitude": _LEVEL}
 _SHAPE = {
     "bands": {"type": "array", "items": _BAND, "minItems": 1, "maxItems": _MOST_BANDS},
-    "rms": form(dict.fromkeys("xyz", _LEVELS), tuple("xyz")),
-    "line": form(
-        {"axis": {"enum": list("xyz")}, "frequency": _LEVEL, "amplitude": _LEVEL},
-        ("axis", "frequency", "amplitude"),
-    ),
-    "height": {"anyOf": [_LEVELS, {"type": "null"}]},
-    "height_total": {"anyOf": [_LEVEL, {"type": "null"}]},
+    "rms": form(dict.fromkeys("xyz", _LEVELS), "xyz"),
+    "line": form({"axis": {"enum": list("xyz")}, **_LINE}, ("axis", *_LINE)),
+    "height": or_none(_LEVELS),
+    "height_total": or_none(_LEVEL),
     "windows": {"type": "integer", "minimum": 1},
     "alarm": {"type": "boolean"},
     "limit": _LEVEL,
 }
-_LINE_OF_HEIGHT = form(
-    dict.fromkeys(("frequency", "amplitude"), _LEVEL), ("frequency", "amplitude")
-)
 # Older recordings lack ``height_line`` and ``height_noise``.
-_LATER = {"height_line": _LINE_OF_HEIGHT, "height_noise": {"anyOf": [_LEVEL, {"type": "null"}]}}
+_LATER = {"height_line": form(_LINE, tuple(_LINE)), "height_noise": or_none(_LEVEL)}
 _SCHEMA = form({**_SHAPE, **_LATER}, tuple(_SHAPE))
 
 
