@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import interpolate, signal
+from linear_segments import through
+from scipy import interpolate
 from soaked import soaked
 
 from omsm_ros.core.calibration.calibration import Calibration
@@ -179,8 +180,7 @@ def test_error_of_a_path_is_that_of_an_independent_simulation(path) -> None:
     fine = 8
     time = np.arange((len(z) - 1) * fine + 1) * PERIOD / fine
     dense = interpolate.CubicSpline(np.arange(len(z)) * PERIOD, z)(time)
-    system = signal.lti(g.numerator[::-1], g.denominator[::-1])
-    late = signal.lsim(system, dense - dense[0], time)[1][::fine] + dense[0]
+    late = through(g.numerator[::-1], g.denominator[::-1], dense, PERIOD / fine)[::fine] + dense[0]
     found = predict_error(paper(), ScanPath(z=z, sample_period=PERIOD))
     settled = slice(200, None)
     assert found.peak_to_valley == pytest.approx(np.ptp((z - late)[settled]), rel=0.02)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy import signal
+from linear_segments import through
 
 from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.estimation.preparation import check_axis_steps, prepare
@@ -44,7 +44,7 @@ def behind(positions, backlash):
 def record_of(z, step=0.0, machine=LAG, noise=NOISE, backlash=0.0):
     time = np.arange(len(z) * FINER) * PERIOD / FINER
     fine = np.interp(time, np.arange(len(z)) * PERIOD, z)
-    seen = signal.lsim(signal.TransferFunction([1.0], machine), fine, time)[1][::FINER]
+    seen = through([1.0], machine, fine, PERIOD / FINER)[::FINER]
     distance = 40e-6 - behind(seen, backlash) + np.random.default_rng(3).normal(0, noise, len(z))
     rounded = np.round(z / step) * step if step else z
     return record_from_arrays(PERIOD, rounded, distance)

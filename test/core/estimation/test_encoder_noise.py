@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from linear_segments import through
 from scipy import signal
 from soaked import soaked
 
@@ -18,7 +19,7 @@ PERIOD, FINER, RAMP, STEP, READING = 1e-3, 5, 20, 9.8e-6, 10e-9
 # A lightly damped mode of 5 %, which amplifies white noise of the axis.
 FREQUENCY, DAMPING = 60.0, 0.05
 OMEGA = 2 * np.pi * FREQUENCY
-MODE = signal.TransferFunction([1.0], [OMEGA**-2, 2 * DAMPING / OMEGA, 1.0])
+MODE = [OMEGA**-2, 2 * DAMPING / OMEGA, 1.0]
 
 
 def staircase(rest, edges=20):
@@ -36,7 +37,7 @@ def staircase(rest, edges=20):
 def seen_by_probe(moved):
     time = np.arange(len(moved) * FINER) * PERIOD / FINER
     fine = np.interp(time, np.arange(len(moved)) * PERIOD, moved)
-    return signal.lsim(MODE, fine, time)[1][::FINER]
+    return through([1.0], MODE, fine, PERIOD / FINER)[::FINER]
 
 
 def record_of(moved, noise, seed=2):
