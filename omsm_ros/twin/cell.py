@@ -26,7 +26,7 @@ from omsm_ros.core.streams.blocks import (
 from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.errors import DataError
 from omsm_ros.quantities import LENGTH, SAMPLE_PERIOD, CheckedRecord
-from omsm_ros.twin.disturbances import Disturbances, TrueResponse, Vibration
+from omsm_ros.twin.disturbances import Disturbances, TrueResponse, VibrationLine, with_phases
 from omsm_ros.twin.machine_errors import Shift, random_walk
 from omsm_ros.twin.part import UnderSpot, mounted_surface
 from omsm_ros.twin.plant import Plant, TimeGrid, Trajectory, move
@@ -90,7 +90,7 @@ class Scene:
     slide: Trajectory
     probe: Trajectory
     shifting: tuple[ShiftFunction, ...]
-    vibration: Vibration
+    vibration: tuple[VibrationLine, ...]
 
     def positions(self, time: FloatArray) -> AxisPositions:
         """Return the true positions of the axes: the command, and the wobble of B."""
@@ -144,19 +144,19 @@ class Scene:
         if len(before) > 1:
             looks = (look, *(self.look(time - ago, look.distance) for ago in before[1:]))
             look = ProbeTarget(*(weights @ np.array(parts) for parts in zip(*looks, strict=True)))
-        if not self.vibration.lines:
+        if not self.vibration:
             return look
         # Lines may be faster than the nodes of the exposure, so their mean is in closed form.
         middle, half = time - probe.lag_s, probe.window_s / 2
         begin, c, end = (self.motion.positions(middle + d).c for d in (-half, 0.0, half))
-        shaken = self.vibration.height(middle, c, probe.window_s, end - begin)
+        shaken = sum(v.height(middle, c, probe.window_s, end - begin) for v in self.vibration)
         return look._replace(distance=look.distance + shaken)
 
     def acceleration(self, time: FloatArray, period: float) -> FloatArray:
         """Return the acceleration of the probe along Z [m/s²] at ``time`` (n,) [s]."""
         c = self.motion.positions(time).c
         speed = np.asarray(np.gradient(c, period))
-        shaken = self.vibration.acceleration(time, c, speed)
+        shaken = sum(line.acceleration(time, c, speed) for line in self.vibration)
         # A motion of the part towards the probe counts as a motion of the probe downwards.
         return np.asarray(acceleration_of(self.probe).at(time) - shaken)
 
@@ -178,7 +178,6 @@ def scene_of(
         moved = deform(disturbances.structure, moved, slide_x)
     if spot := disturbances.probe.spot_m:
         surface = UnderSpot(surface, spot)
-    vibration = Vibration.of(disturbances.vibration, random["vibration"])
     return Scene(
         disturbances=disturbances,
         motion=motion,
@@ -187,7 +186,7 @@ def scene_of(
         slide=moved.slide,
         probe=moved.probe,
         shifting=tuple(_shifting(disturbances, times, random)),
-        vibration=vibration,
+        vibration=with_phases(disturbances.vibration, random["vibration"]),
     )
 
 

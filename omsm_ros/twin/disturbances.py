@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,49 +40,40 @@ class VibrationLine(CheckedRecord):
                 "VibrationLine: frequency_hz and per_turn are both zero; give one of them"
             )
 
-    def height(self, time: FloatArray, c: FloatArray, random_phase: float) -> FloatArray:
-        """Return the height [m] at ``time`` (n,) [s] and spindle angle ``c`` (n,) [rad]."""
-        phase = random_phase if self.phase_rad is None else self.phase_rad
-        turning = 2 * np.pi * self.frequency_hz * time + self.per_turn * c + phase
-        return np.asarray(self.amplitude_m * np.sin(turning), np.float64)
-
-    def turn(self, duration_s: float, spindle_rad: FloatArray) -> FloatArray:
-        """Return the change of its phase [rad] while the spindle turns by ``spindle_rad`` (n,)."""
-        return 2 * np.pi * self.frequency_hz * duration_s + self.per_turn * spindle_rad
-
-
-@dataclass(frozen=True)
-class Vibration:
-    """Several lines with their phases [rad]."""
-
-    lines: Sequence[VibrationLine]
-    phases: Sequence[float]
-
-    @classmethod
-    def of(cls, lines: Sequence[VibrationLine], random: np.random.Generator) -> Vibration:
-        """Return the lines with random phases for those without one."""
-        return cls(lines, random.uniform(0.0, 2 * np.pi, len(lines)).tolist())
-
     def height(
-        self, middle: FloatArray, c: FloatArray, exposure_s: float, turned: FloatArray
+        self,
+        middle: FloatArray,
+        c: FloatArray,
+        exposure_s: float = 0.0,
+        turned: FloatArray | float = 0.0,
     ) -> FloatArray:
-        """Return the sum of all lines, averaged over exposures [m].
+        """Return the height, averaged over exposures [m].
 
         middle: of the exposures (n,) [s];  c: spindle angle then (n,) [rad]
         turned: rotation of the spindle within an exposure (n,) [rad]
         """
-        total = np.zeros_like(middle)
-        for line, phase in zip(self.lines, self.phases, strict=True):
-            dimmed = np.sinc(line.turn(exposure_s, turned) / (2 * np.pi))
-            total += dimmed * line.height(middle, c, phase)
-        return total
+        phase = 2 * np.pi * self.frequency_hz * middle + self.per_turn * c + (self.phase_rad or 0.0)
+        dimmed = np.sinc(self._turn(exposure_s, turned) / (2 * np.pi))
+        return np.asarray(dimmed * (self.amplitude_m * np.sin(phase)), np.float64)
 
     def acceleration(self, time: FloatArray, c: FloatArray, spindle: FloatArray) -> FloatArray:
         """Return the second derivative of the height [m/s²] at speeds ``spindle`` (n,) [rad/s]."""
-        total = np.zeros_like(time)
-        for line, phase in zip(self.lines, self.phases, strict=True):
-            total -= line.turn(1.0, spindle) ** 2 * line.height(time, c, phase)
-        return total
+        return np.asarray(-(self._turn(1.0, spindle) ** 2) * self.height(time, c), np.float64)
+
+    def _turn(self, duration_s: float, spindle_rad: FloatArray | float) -> FloatArray | float:
+        """Return the change of the phase [rad] while the spindle turns by ``spindle_rad``."""
+        return 2 * np.pi * self.frequency_hz * duration_s + self.per_turn * spindle_rad
+
+
+def with_phases(
+    lines: Sequence[VibrationLine], random: np.random.Generator
+) -> tuple[VibrationLine, ...]:
+    """Return the lines with random phases for those without one."""
+    phases = random.uniform(0.0, 2 * np.pi, len(lines)).tolist()
+    return tuple(
+        replace(line, phase_rad=phase) if line.phase_rad is None else line
+        for line, phase in zip(lines, phases, strict=True)
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

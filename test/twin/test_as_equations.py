@@ -9,7 +9,7 @@ from benchmarks.twin_motions import respond
 from omsm_ros.core.kinematics.trajectories import Chirp
 from omsm_ros.core.model_errors.families import dahl_friction
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.disturbances import Vibration, VibrationLine
+from omsm_ros.twin.disturbances import VibrationLine
 from omsm_ros.twin.part import AzimuthalRipple, PartPose
 from omsm_ros.twin.plant import PAPER_DYNAMICS, Movement, Plant, TimeGrid, Trajectory, move
 from omsm_ros.twin.probe import ProbeErrors
@@ -205,7 +205,7 @@ def test_a_line_in_an_exposure_is_its_mean(exposure):
     line = VibrationLine(amplitude_m=1e-7, frequency_hz=90.0, per_turn=12.0, phase_rad=0.7)
     speed, middle = 3.0, np.array([0.2, 0.5])
     c = speed * middle
-    found = Vibration((line,), (0.0,)).height(middle, c, exposure, np.full(2, speed * exposure))
+    found = line.height(middle, c, exposure, np.full(2, speed * exposure))
     for at, height in zip(middle, found, strict=True):
 
         def seen(t):
@@ -218,7 +218,7 @@ def test_a_line_in_an_exposure_is_its_mean(exposure):
     h = 1e-5
     three = [line.height(middle + k * h, speed * (middle + k * h), 0.0) for k in (-1, 0, 1)]
     second = (three[0] - 2 * three[1] + three[2]) / h**2
-    shaken = Vibration((line,), (0.0,)).acceleration(middle, c, np.full(2, speed))
+    shaken = line.acceleration(middle, c, np.full(2, speed))
     np.testing.assert_allclose(shaken, second, rtol=1e-4)
 
 
