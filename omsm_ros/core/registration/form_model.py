@@ -292,13 +292,19 @@ def _sizes(form: FloatArray, unknown: FloatArray, least: FloatArray, group: IntA
     They fall with ``n**-_STEEPEST`` at most, because a shift of an asphere looks like coma: trefoil
     alone must not bound the coma.  unknown: share of each term that the data leave open (k,)
     """
-    new, above = np.empty_like(form), 0.0
+    new, above, before = np.empty_like(form), 0.0, 0
     for each in np.unique(group)[::-1]:
         chosen = group == each
-        known = max(float(np.sum(1 - unknown[chosen])), 1e-3)
-        value = max(float(np.sum(form[chosen] ** 2)) / known, float(least[chosen].max()))
+        known, total = float(np.sum(1 - unknown[chosen])), float(np.sum(form[chosen] ** 2))
+        value = total / max(known, 1e-3)
+        if above and each != _RINGS and known < 1:
+            # Data that show less than a term do not show more than the next order lets expect.
+            usual = above * (before / each) ** (2 * _FALL)
+            value = min(value, total + (1 - known) * usual)
+        value = max(value, float(least[chosen].max()))
         if each != _RINGS:
             value = above = max(value, above)
+            before = each
         new[chosen] = value
     ratio = group / group[:, np.newaxis]
     lower = np.where(ratio <= 1, ratio, 0.0) ** (2 * _STEEPEST)

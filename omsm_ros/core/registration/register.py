@@ -158,19 +158,18 @@ def register(
     or a fit that does not converge.
     """
     surface, aperture = within_aperture(surface, aperture)
-    chosen = selection(portions, _MOST_SELECTED)
-    shape = shape_asked(asked)
-    begin = start_of(surface, shape, chosen.x, chosen.y, chosen.height) if shape else {}
-    start = Placement(shape=tuple(begin.items()))
-    dofs = _determined(surface, chosen, asked, aperture, start, declared)
-    try:
-        at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
-    except DataError:
-        # On a tilted part an undetermined rotation may seem to be determined; seat it first.
-        seat = [n for n in (*POSE_PARAMETERS[:3], *shape_asked(asked)) if n not in dofs.refused]
-        seated = coarse_placement(surface, chosen, seat, aperture, start)
-        dofs = _determined(surface, chosen, asked, aperture, seated, declared)
-        at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
+    chosen, shape = selection(portions, _MOST_SELECTED), shape_asked(asked)
+    start, vertex = start_of(surface, shape, *chosen[:3]) if shape else ({}, np.zeros(2))
+    if {"x", "y"} & set(declared):
+        vertex = np.zeros(2)
+    chosen, near = _about(vertex, chosen), lambda: (_about(vertex, p) for p in portions())
+    at = Placement(shape=tuple(start.items()))
+    dofs = _determined(surface, chosen, asked, aperture, at, declared)
+    # A conic constant decides what the surface determines.
+    if seat := [n for n in dofs.fitted if n in (*POSE_PARAMETERS[:3], *shape)]:
+        at = coarse_placement(surface, chosen, seat, aperture, at)
+        dofs = _determined(surface, chosen, asked, aperture, at, declared)
+    at = coarse_placement(surface, chosen, dofs.fitted, aperture, at)
     points = inside_aperture(placed(surface, at, chosen), aperture)
     disc = aperture.disc if aperture else disc_of(points.x, points.y)
     x, y = (v[:: -(-len(v) // _MOST_OF_BASIS)] for v in (points.x, points.y))
@@ -184,7 +183,13 @@ def register(
     if aperture is None:
         points = inside_aperture(placed(surface, stand.at, chosen), None)
         disc = disc_of(points.x, points.y)
-    return _over_all(fit, stand, portions, sources, open_, dust, disc)
+    found = _over_all(fit, stand, near, sources, open_, dust, disc)
+    return replace(found, placement=found.placement.moved(("x", "y"), vertex))
+
+
+def _about(vertex: FloatArray, portion: PointBatch) -> PointBatch:
+    """Return points from the place x, y of the ``vertex`` (2,) [m]."""
+    return portion._replace(x=portion.x - vertex[0], y=portion.y - vertex[1])
 
 
 def _determined(
@@ -195,9 +200,15 @@ def _determined(
     at: Placement,
     declared: Mapping[str, float],
 ) -> PoseParameters:
-    """Return which pose parameters the surface determines where the part is ``at``."""
+    """Return which pose parameters the surface determines where the part is ``at``.
+
+    Points on an untilted surface decide, because on a tilted one all rotations and shifts mix.
+    """
     points = inside_aperture(placed(surface, at, chosen), aperture)
-    columns = dof_columns(at, points, (*POSE_PARAMETERS, *shape_asked(asked)))
+    level = Placement(shape=at.shape)
+    height = level.of(surface).height(points.x, points.y)
+    on_it = placed(surface, level, PointBatch(points.x, points.y, height, chosen.systematic[:0]))
+    columns = dof_columns(level, on_it, (*POSE_PARAMETERS, *shape_asked(asked)))
     return determined_dofs(asked, columns @ columns.T, len(points.x), declared)
 
 
@@ -332,7 +343,12 @@ class _PoseFit:
         # Correlated errors average out more slowly, by this factor of their variance.
         together = float(np.mean(sums.scores[free:] / own)) / variance if variance > 0 else 1.0
         square = sums.gram[:, : sums.columns]
-        moments, largest = sums.gram[:, sums.columns], sums.total / max(sums.points, 1)
+        moments = sums.gram[:, sums.columns]
+        # What a step of the pose alone corrects does not show how large the form is.
+        scale = np.sqrt(np.diag(square)[:free])
+        pose, right = square[:free, :free] / np.outer(scale, scale), moments[:free] / scale
+        left = sums.total - float(right @ np.linalg.lstsq(pose, right, rcond=1e-12)[0])
+        largest = max(left, sums.square) / max(sums.points, 1)
         noise, expected = variance * max(together, 1.0), self.expected(at)
         found = estimate(square, moments, noise, largest, self.basis.group, expected)
         return found, variance
@@ -372,6 +388,8 @@ class _PoseFit:
                 limit = outlier_limit(points.deviation - smooth)
                 return _PlacementState(at, like, limit, found, sums)
             share, last = relaxation_factor(share, last, step), step
+            # A longer step than the deviation corrects none of it: form would have to cancel it.
+            share *= min(1.0, np.sqrt(sums.total / sums.points / square))
             at = at.moved(self.names, share * found.step)
         raise DataError(NOT_SETTLED)
 

@@ -26,6 +26,9 @@ ALIASES = {
 }
 # Largest radius [m], of a plane, and steps of central differences: relative, and least.
 _FLAT_M, _SHARE, _STEP = 9e9, 1e-4, 1e-5
+# Share of the radius within which the middle of the points is the origin, and of the curvature
+# below which a direction is straight.
+_CENTRED, _CYLINDER = 0.25, 1e-2
 # Least radius at the start, in half widths of the points.
 _LEAST_RADIUS = 1.2
 
@@ -92,8 +95,12 @@ def shape_columns(
 
 def start_of(
     surface: Any, names: tuple[str, ...], x: FloatArray, y: FloatArray, height: FloatArray
-) -> dict[str, float]:
+) -> tuple[dict[str, float], FloatArray]:
     """Return values to start the estimate from: curvatures of the points, else those stated.
+
+    The second value is the place x, y (2,) [m] where the vertex is expected: the origin, unless it
+    is farther from the middle of the points than a quarter of their radius; then the place among
+    them where they are level.
 
     Raises ConfigurationError for a parameter that the surface does not have.
     """
@@ -105,7 +112,8 @@ def start_of(
     columns = np.stack([np.ones_like(u), u, v, u * u / 2, v * v / 2, u * v])
     good = np.isfinite(rest)
     curved = np.linalg.lstsq(columns[:, good].T, rest[good], rcond=1e-12)[0]
-    most = 1 / (_LEAST_RADIUS * float(np.hypot(u, v).max()))
+    radius = float(np.hypot(u, v).max())
+    most = 1 / (_LEAST_RADIUS * radius)
     curvature = {"radius_x": curved[3], "radius_y": curved[4], "parent_focal_length": 2 * curved[4]}
     found = {}
     for name in names:
@@ -114,4 +122,9 @@ def start_of(
             found[name] = float(np.clip(value, -most, most))
         else:
             found[name] = float(stated[name])
-    return found
+    if np.hypot(x.mean(), y.mean()) < _CENTRED * radius:
+        return found, np.zeros(2)
+    hessian = np.array([[curved[3], curved[5]], [curved[5], curved[4]]])
+    away = -np.linalg.lstsq(hessian, curved[1:3], rcond=_CYLINDER)[0]
+    away *= min(1.0, radius / max(float(np.hypot(*away)), 1e-300))
+    return found, np.array([x.mean(), y.mean()]) + away

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from omsm_ros.core.registration.form_model import Estimate, _upper_variances
+from omsm_ros.core.registration.form_model import Estimate, FormBasis, _upper_variances, estimate
 from omsm_ros.core.registration.placement import POSE_PARAMETERS, PointBatch
 from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.core.registration.register import register
@@ -52,6 +52,25 @@ def test_one_large_term_is_not_drawn_to_the_law_of_the_others():
     order = np.repeat(np.arange(2, 9), np.arange(3, 10))
     sizes = np.where(order == 2, 300e-9, 1e-9) ** 2
     assert _upper_variances(sizes, np.where(order == 2, 1 / 3, 0.0), order)[0] > 300e-9**2
+
+
+@pytest.mark.parametrize("seed", [1, 6, 9])
+def test_form_that_the_pose_hides_does_not_grow_to_cancel_a_long_step(seed):
+    """Where all terms of order 2 look like moves, chance in the others tells nothing of them."""
+    rng = np.random.default_rng(seed)
+    r, angle = np.sqrt(rng.random(4000)), 2 * np.pi * rng.random(4000)
+    x, y = r * np.cos(angle), r * np.sin(angle)
+    basis = FormBasis.over(x, y, np.ones(4000), Aperture(1.0))
+    form, order = basis.columns(x, y), np.where(basis.group > 8, 4, basis.group)
+    moves = form[basis.group == 2] + 0.01 * form[basis.group == 6][:3]
+    sizes = 50e-9 * order**-2.5 * rng.normal(size=len(form))
+    height = sizes @ form + rng.normal(0, 1e-9, 4000)
+    columns, mean_square = np.concatenate([moves, form]), float(np.mean(height**2))
+    expected = np.zeros(3), np.full(3, 1e-3)
+    found = estimate(
+        columns @ columns.T, columns @ height, 1e-18, mean_square, basis.group, expected
+    )
+    assert np.linalg.norm(found.form[basis.group == 2]) < mean_square**0.5 / 2
 
 
 @pytest.mark.soak

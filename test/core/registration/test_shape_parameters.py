@@ -46,6 +46,33 @@ def test_exact_points_give_the_parameters_from_any_start(guess, true):
         assert found[name][0] == pytest.approx(value, abs=3e-7 * size)
 
 
+@pytest.mark.parametrize(
+    ("guess", "true"),
+    [
+        (Sphere(1.0), {"radius": 0.025}),
+        (Toroid(1.0, 1.0), {"radius_x": -0.035, "radius_y": -0.076}),
+        (Asphere(1.0), {"radius": 0.028, "conic_constant": -1.9}),
+    ],
+)
+def test_a_part_away_from_the_origin_has_the_parameters_of_the_one_at_it(guess, true):
+    """An instrument may have its origin at a corner; the vertex is then where points are level."""
+    made = type(guess)(**{f: getattr(guess, f) for f in guess.__dataclass_fields__} | true)
+    rng = np.random.default_rng(5)
+    height = PosedSurface(made, Pose(tip=2e-3, tilt=-3e-3)).height(X, Y)
+    height += rng.normal(0, 2e-9, N)
+    found = {}
+    for at in ((0.0, 0.0), (1.7 * R, 2.6 * R)):
+        batch = PointBatch(X + at[0], Y + at[1], height, np.empty((0, N)))
+        one = register(guess, lambda batch=batch: [batch], ("auto", *true))
+        assert abs(one.placement.value("x") - at[0]) < 2e-3
+        found[at] = {n: (v, one.uncertainty(n)) for n, v in one.placement.shape}
+    here, away = found.values()
+    for name in true:
+        value, spread = external(name, *away[name])
+        assert value == pytest.approx(external(name, *here[name])[0], abs=0.2 * spread)
+        assert abs(value - true[name]) < 3 * spread
+
+
 def test_the_radius_is_within_two_uncertainties_on_parts_with_form():
     """Power of the part is part of its form, so that it counts in the uncertainty of the radius."""
     u, v = X / R, Y / R
