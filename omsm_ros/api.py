@@ -84,20 +84,13 @@ def identify(
     from omsm_ros.core.identification.identify import identify as identify_record
     from omsm_ros.core.streams.motion_record import assemble
 
-    pairs = list(_recording(recording, distance, period).blocks())
+    if not isinstance(recording, Recording):
+        if distance is None or period is None:
+            raise ConfigurationError("arrays need distance and period; or give a Recording")
+        recording = Recording(np.asarray(recording), np.asarray(distance), period)
+    pairs = list(recording.blocks())
     record = assemble([a for a, _ in pairs], [d for _, d in pairs])
     return Calibration(identify_record(record, order=order, settings=settings).calibration)
-
-
-def _recording(
-    given: Recording | ArrayLike, distance: ArrayLike | None, period: float | None
-) -> Recording:
-    if isinstance(given, Recording):
-        return given
-    if distance is None or period is None:
-        raise ConfigurationError("arrays need distance and period; or give a Recording")
-    z, reading = (np.asarray(v, np.float64) for v in (given, distance))
-    return Recording(z, reading, period)
 
 
 def correct(
@@ -237,7 +230,12 @@ def adjust(
     from omsm_ros.pipelines.adjust import adjust_bags, adjustment_facts
 
     with tempfile.TemporaryDirectory() as folder:
-        paths = [_bag_of(scan, Path(folder) / f"scan_{k + 1}.mcap") for k, scan in enumerate(scans)]
+        paths = []
+        for k, scan in enumerate(scans):
+            given = isinstance(scan, Recording)
+            paths.append(Path(folder) / f"scan_{k + 1}.mcap" if given else Path(scan))
+            if given:
+                scan.save(paths[k])
         found, read_scans = adjust_bags(
             paths,
             calibration.core,
@@ -248,14 +246,6 @@ def adjust(
         )
     facts = adjustment_facts(found, read_scans, calibration.core, tolerance)
     return Adjusted.of(found.form, facts=facts)
-
-
-def _bag_of(scan: Recording | Path | str, place: Path) -> Path:
-    """Return the path of a bag; a recording is written to ``place`` first."""
-    if not isinstance(scan, Recording):
-        return Path(scan)
-    scan.save(place)
-    return place
 
 
 def difference(

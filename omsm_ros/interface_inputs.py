@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -156,14 +156,20 @@ def read(path: Path | str, columns: Path | str | None = None) -> Recording:
     29000
     """
     if columns is not None:
-        return _read_table(Path(path), Path(columns))
+        from omsm_ros.io.tables.table import load_column_map
+        from omsm_ros.pipelines.importing import import_recording
+
+        with tempfile.TemporaryDirectory() as folder:
+            bag = Path(folder) / "recording.mcap"
+            import_recording([Path(path)], *load_column_map(Path(columns)), bag)
+            return replace(read(bag), name=str(path))
     from omsm_ros.io import bags
     from omsm_ros.io.topics import AXES_TOPIC, DISTANCE_TOPIC
 
     axes: list[AxisBlock] = []
     distance: list[DistanceBlock] = []
-    with bags.BagReader(path) as bag:
-        for _, _, block in bag.blocks(AXES_TOPIC, DISTANCE_TOPIC):
+    with bags.BagReader(path) as reader:
+        for _, _, block in reader.blocks(AXES_TOPIC, DISTANCE_TOPIC):
             (axes if isinstance(block, AxisBlock) else distance).append(block)
     if not axes or not distance:
         raise DataError(f"{str(path)!r} has no samples of axes and probe; record both")
@@ -175,18 +181,6 @@ def read(path: Path | str, columns: Path | str | None = None) -> Recording:
         for name in names
     }
     return Recording(**made, period=float(axes[0].sample_period), name=str(path))
-
-
-def _read_table(path: Path, columns: Path) -> Recording:
-    from omsm_ros.io.tables.table import load_column_map
-    from omsm_ros.pipelines.importing import import_recording
-
-    mapped, form = load_column_map(columns)
-    with tempfile.TemporaryDirectory() as folder:
-        bag = Path(folder) / "recording.mcap"
-        import_recording([path], mapped, form, bag)
-        found = read(bag)
-    return Recording(found.z, found.distance, found.period, found.x, found.c, str(path))
 
 
 def load(path: Path | str) -> Any:
@@ -216,10 +210,6 @@ def load(path: Path | str) -> Any:
         return Calibration(load_calibration(file))
     if file.suffix == ".npz":
         return load_saved(file)
-    return _points_of(file)
-
-
-def _points_of(file: Path) -> Points:
     from omsm_ros.io.maps.read_map import read_points
 
     found = read_points(file)

@@ -198,14 +198,11 @@ class Recording(Result):
 
 def _over_time(time: FloatArray, curves: Mapping[str, FloatArray]) -> Figure:
     """Draw ``curves`` (n,) [m] over time [s], one below the other, in µm."""
-    from omsm_ros.report import style
+    from omsm_ros.report.style import Panel, panels
 
-    made, axes = style.figure(9.2, 4.5, len(curves), 1, sharex=True)
-    for ax, (name, values) in zip(axes[:, 0], curves.items(), strict=True):
-        ax.plot(time, values / 1e-6, linewidth=0.8)
-        style.label(ax, y=f"{name} [µm]")
-    style.label(axes[-1, 0], x="time [s]")
-    return made
+    return panels(
+        *(Panel("", "time [s]", f"{n} [µm]", {"": (time, v / 1e-6)}) for n, v in curves.items())
+    )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -382,14 +379,10 @@ class Spectrum(Result):
         yield "rms", plain(self.rms(float(self.frequency[1])))
 
     def _figure(self) -> Figure:
-        from omsm_ros.report import style
+        from omsm_ros.report.style import Panel, panels
 
-        made, axes = style.figure(9.2, 4.0)
-        axes[0, 0].plot(self.frequency[1:], self.density[1:], linewidth=0.8)
-        style.logarithmic(axes[0, 0].xaxis)
-        style.logarithmic(axes[0, 0].yaxis)
-        style.label(axes[0, 0], x="frequency [Hz or 1/m]", y="density [unit²/Hz or unit²·m]")
-        return made
+        x, y = "frequency [Hz or 1/m]", "density [unit²/Hz or unit²·m]"
+        return panels(Panel("", x, y, {"": (self.frequency[1:], self.density[1:])}, log="xy"))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

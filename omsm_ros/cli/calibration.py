@@ -8,16 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from omsm_ros.cli.arguments import Arguments, cell_of, number, trigger_of
-from omsm_ros.cli.command import (
-    CliCommand,
-    Facts,
-    output_path_for,
-    rejected,
-    say,
-    say_lines,
-    table,
-    written,
-)
+from omsm_ros.cli.command import CliCommand, Facts, kept, rejected, say, say_lines, table, written
 from omsm_ros.core.calibration.calibration_set import calibration_set
 from omsm_ros.core.calibration.repeatability import (
     CalibrationChange,
@@ -27,7 +18,7 @@ from omsm_ros.core.calibration.repeatability import (
     repeatability,
 )
 from omsm_ros.errors import CalibrationError, ConfigurationError
-from omsm_ros.io.calibration_file import load_calibration, save_calibration
+from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.pipelines.verify_calibration import established_offset, path_check_of
 from omsm_ros.quantities import POSITION, TABLE_ANGLE, shown
 from omsm_ros.readable import measured, p_value_text, plain, quantity
@@ -153,8 +144,7 @@ def _calset(args: argparse.Namespace) -> Facts:
         raise CalibrationError(f"a set along {' and '.join(axes)}, expected one axis; make two")
     placed = [(position, load_calibration(path)) for path, _, position in args.placed]
     made = calibration_set(axes[0], placed)
-    path = output_path_for(args.out, made.certificate.verdict or "")
-    save_calibration(path, made)
+    path = kept(args.out, made)
     return {
         "along": made.along,
         "positions": list(made.positions),

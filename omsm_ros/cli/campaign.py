@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from urllib.parse import quote, urlsplit
 
@@ -18,7 +18,6 @@ from omsm_ros import __version__
 from omsm_ros.cli.arguments import ADDRESS, Arguments
 from omsm_ros.cli.command import CliCommand, Facts, say, table, written
 from omsm_ros.errors import ConfigurationError, FileError
-from omsm_ros.io import bags
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.files import (
     REPORT,
@@ -32,6 +31,7 @@ from omsm_ros.io.files import (
 from omsm_ros.io.folders import locked_folder
 from omsm_ros.io.json_and_yaml import TEXT, group, or_none, ranged
 from omsm_ros.io.results import read_summary
+from omsm_ros.pipelines.history import recorded_ns_of
 from omsm_ros.pipelines.progress import Progress, state_progress
 from omsm_ros.quantities import PROCESSES, STAMP, shown
 
@@ -103,18 +103,18 @@ def run_campaign(
     with _locked(out):
         earlier = {entry.bag: entry for entry in load_campaign(out)}
         tasks = [_task(bag, folder, calibration, out, options, sign) for bag in found]
-        entries = {t.bag: earlier[t.bag] for t in tasks if _is_done(earlier.get(t.bag), t, out)}
-        waiting = [task for task in tasks if task.bag not in entries]
+        entries = {e.bag: earlier[e.bag] for e, _ in tasks if _is_done(earlier.get(e.bag), e, out)}
+        waiting = [task for task in tasks if task[0].bag not in entries]
         progress(len(entries), len(tasks))
         with _executor(jobs or os.cpu_count() or 1, scheduler) as executor:
-            asked = {executor.submit(correct_one, task): task for task in waiting}
+            asked = {executor.submit(correct_one, *task): task[0] for task in waiting}
             for future in as_completed(asked):
-                task = asked[future]
-                entries[task.bag] = Entry(task.bag, task.folder, task.fingerprint, *_result(future))
+                entry = asked[future]
+                entries[entry.bag] = _result(future, entry)
                 _save(out, entries)
                 progress(len(entries), len(tasks))
         _save(out, entries)
-    return [entries[task.bag] for task in tasks]
+    return [entries[entry.bag] for entry, _ in tasks]
 
 
 def bags_below(folder: Path, out: Path) -> list[Path]:
@@ -143,44 +143,34 @@ def load_campaign(out: Path) -> list[Entry]:
     return [Entry(**{k: v for k, v in e.items() if k in known}) for e in content["entries"]]
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
-    """One bag to correct, as plain texts that can be sent to another host."""
-
-    bag: str
-    folder: str
-    fingerprint: str
-    path: str
-    command: tuple[str, ...]
-
-
-def correct_one(task: Task) -> tuple[str, str, int | None]:
-    """Correct one bag in a process of its own; return its state, why, and when it was recorded."""
-    found = REFUSED, "not started", None
+def correct_one(entry: Entry, command: Sequence[str]) -> Entry:
+    """Correct one bag in a process of its own; return its entry with what became of it."""
+    found = replace(entry, state=REFUSED, said="not started")
     for _ in range(_ATTEMPTS):
         try:
             done = subprocess.run(
-                [sys.executable, "-m", "omsm_ros.cli", *task.command],
+                [sys.executable, "-m", "omsm_ros.cli", *command],
                 stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
             )  # fmt: skip
         except OSError as err:
-            found = CRASHED, exception_text(err), None
+            found = replace(entry, state=CRASHED, said=exception_text(err))
             continue
         if done.returncode == 0:
-            return DONE, "", _recorded(task.path)
+            return replace(entry, state=DONE, recorded_ns=recorded_ns_of(Path(command[1])))
         last = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
         if done.returncode > 0:
-            return REFUSED, last.removeprefix("omsm: "), None
-        found = CRASHED, f"ended by {signal.Signals(-done.returncode).name}", None
+            return replace(entry, state=REFUSED, said=last.removeprefix("omsm: "))
+        said = f"ended by {signal.Signals(-done.returncode).name}"
+        found = replace(entry, state=CRASHED, said=said)
     return found
 
 
-def _result(future: Future[tuple[str, str, int | None]]) -> tuple[str, str, int | None]:
+def _result(future: Future[Entry], entry: Entry) -> Entry:
     """Return the result of :func:`correct_one`, also if every worker died that tried it."""
     try:
         return future.result()
     except Exception as err:  # a scheduler raises errors of many kinds for lost workers
-        return CRASHED, f"no worker finished it ({type(err).__name__})", None
+        return replace(entry, state=CRASHED, said=f"no worker finished it ({type(err).__name__})")
 
 
 def _state(file: Path) -> tuple[str, int, int]:
@@ -197,7 +187,8 @@ def _state(file: Path) -> tuple[str, int, int]:
 
 def _task(
     bag: Path, folder: Path, calibration: Path, out: Path, options: Sequence[str], sign: list[str]
-) -> Task:
+) -> tuple[Entry, list[str]]:
+    """Return the entry of a bag that waits, and its command, which can be sent to another host."""
     name = bag.relative_to(folder)
     # A folder bag of the same stem has a result of that name.
     taken = (bag.with_suffix("") / "metadata.yaml").is_file()
@@ -205,33 +196,19 @@ def _task(
     files = sorted(bag.rglob("*")) if bag.is_dir() else [bag]
     states = [_state(file) for file in files]
     fingerprint = hashlib.sha256(repr((states, sign)).encode()).hexdigest()
-    place = str((out / result).absolute())
-    command = ("correct", str(bag.absolute()), "--calibration", str(calibration.absolute()))
-    return Task(
-        str(name),
-        str(result),
-        fingerprint,
-        str(bag),
-        (*command, "--out", place, "--json", *options),
-    )
+    command = ["correct", str(bag.absolute()), "--calibration", str(calibration.absolute())]
+    command += ["--out", str((out / result).absolute()), "--json", *options]
+    return Entry(str(name), str(result), fingerprint, "", ""), command
 
 
-def _is_done(entry: Entry | None, task: Task, out: Path) -> bool:
-    """Return True if the result of this task exists; failed ones are tried again."""
+def _is_done(known: Entry | None, entry: Entry, out: Path) -> bool:
+    """Return True if the result of this bag exists; failed ones are tried again."""
     return (
-        entry is not None
-        and entry.state == DONE
-        and entry.fingerprint == task.fingerprint
-        and (out / task.folder / SUMMARY).is_file()
+        known is not None
+        and known.state == DONE
+        and known.fingerprint == entry.fingerprint
+        and (out / entry.folder / SUMMARY).is_file()
     )
-
-
-def _recorded(path: str) -> int | None:
-    try:
-        with bags.BagReader(path) as bag:
-            return bag.recorded_ns
-    except FileError:
-        return None
 
 
 def _save(out: Path, entries: dict[str, Entry]) -> None:

@@ -1,16 +1,21 @@
 """The parts of a command: arguments, an action that returns facts, and how they are printed."""
 
+from __future__ import annotations
+
 import argparse
 import os
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from omsm_ros.cli.arguments import Arguments
 from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.errors import one_line, printable
+
+if TYPE_CHECKING:
+    from omsm_ros.core.calibration.calibration import Calibration
 
 Facts: TypeAlias = dict[str, Any]
 
@@ -34,6 +39,16 @@ class CliCommand:
 def output_path_for(out: Path, verdict: str) -> Path:
     """Return where to write a result: a rejected one must not replace a good one."""
     return out.parent / f"{out.stem}.rejected.json" if verdict == REJECTED else out
+
+
+def kept(out: Path, calibration: Calibration) -> Path:
+    """Write a calibration to ``out``, a rejected one under another name; return where."""
+    # Imported on demand, because most commands write none.
+    from omsm_ros.io.calibration_file import save_calibration
+
+    path = output_path_for(out, calibration.certificate.verdict or "")
+    save_calibration(path, calibration)
+    return path
 
 
 def rejected(facts: Facts) -> str:

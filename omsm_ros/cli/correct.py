@@ -18,14 +18,12 @@ from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
 from omsm_ros.core.correction.predict import DEFAULT_BUDGET_M, predict_error
 from omsm_ros.core.kinematics.limits import FASTEST
-from omsm_ros.core.kinematics.scan_path import ScanPath
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import json_and_yaml
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import (
     load_geometry,
     load_limits,
-    load_motion,
     load_pitch,
     load_sources,
     load_surface,
@@ -35,7 +33,7 @@ from omsm_ros.io.folders import MEASUREMENT_FILES, result_folder
 from omsm_ros.pipelines.correct import Admission, StampJoining
 from omsm_ros.pipelines.history import keep_measurement, record_in_catalogue
 from omsm_ros.pipelines.measure import measure
-from omsm_ros.pipelines.recording import Recording
+from omsm_ros.pipelines.recording import scan_path_of
 from omsm_ros.quantities import BUDGET, EXPOSURE, LAG, RADIUS, STAMP_DELAY, UNCERTAINTY
 from omsm_ros.readable import measured, plain, quantity, rounded_down
 from omsm_ros.report.verdict import headline, next_steps
@@ -57,7 +55,9 @@ def _declare_correct(add: Arguments) -> None:
     add("--pitch", "PITCH.csv")
     add("--probe-latency", LAG)
     add("--lateral-lag", LAG, SUPPRESS, dest="probe_latency")  # its former name
-    _declare_uncertain(add)
+    add("--sources", str, metavar="SOURCES.yaml")
+    add("--accuracy", BUDGET)
+    add("--lateral", UNCERTAINTY, "standard uncertainty of x and y [m]", default=0.0)
     add("--settings", json_object, "settings of this scan", metavar="JSON")
     add("--delay", STAMP_DELAY, default=0.0)
     add("--exposure", EXPOSURE, "exposure time of the probe [s]", default=0.0)
@@ -69,12 +69,6 @@ def _declare_correct(add: Arguments) -> None:
     declare_fit(add, None)
     declare_tolerance(add)
     add.catalogue()
-
-
-def _declare_uncertain(add: Arguments) -> None:
-    add("--sources", str, metavar="SOURCES.yaml")
-    add("--accuracy", BUDGET)
-    add("--lateral", UNCERTAINTY, "standard uncertainty of x and y [m]", default=0.0)
 
 
 def _check_options(args: argparse.Namespace) -> None:
@@ -164,11 +158,7 @@ def _predict(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     if args.motion.suffix.lower() == TABLE_SUFFIX:
         refuse_cell(args.motion, args)
-        z, period = load_motion(args.motion)
-        path = ScanPath(z=z, sample_period=period)
-    else:
-        with Recording(cell_of(args.motion, args)) as recording:
-            path = recording.scan_path()
+    path = scan_path_of(cell_of(args.motion, args))
     return asdict(predict_error(calibration, path, args.budget, load_limits(args.limits)))
 
 

@@ -18,7 +18,7 @@ from omsm_ros.cli.arguments import (
     refuse_cell,
     trigger_of,
 )
-from omsm_ros.cli.command import CliCommand, Facts, output_path_for, rejected, table, written
+from omsm_ros.cli.command import CliCommand, Facts, kept, output_path_for, rejected, table, written
 from omsm_ros.core.calibration.calibration import FURTHER_AXES, Calibration
 from omsm_ros.core.calibration.certificate import NOTE, Origin, from_json, of_severity
 from omsm_ros.core.estimation.equivalent_time import fast_mode
@@ -36,7 +36,6 @@ from omsm_ros.core.identification.sampled_identification import identify_samples
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.io.descriptions import load_multisine
 from omsm_ros.io.files import atomic_file
 from omsm_ros.pipelines.history import keep_calibration, record_in_catalogue
@@ -83,18 +82,14 @@ def _declare(add: Arguments) -> None:
     add("--duration", DURATION, "use the first seconds only [s]; 0 = all", default=0.0)
     add("--settings", json_object, default={}, metavar="JSON")
     add("--equivalent-time", None)
-    _declare_use(add)
-    add.trigger()
-    add("--report", "DIR", "write the certificate, or the model's page")
-    add.catalogue()
-
-
-def _declare_use(add: Arguments) -> None:
     add("--for", "SCAN", dest="scan")
     add("--accuracy", UNCERTAINTY)
     add.origin()
     add("--multisine", "BAG")
     add("--plan", "PLAN.json", "plan of the multisine, as 'omsm plan multisine' writes it")
+    add.trigger()
+    add("--report", "DIR", "write the certificate, or the model's page")
+    add.catalogue()
 
 
 def _identify(args: argparse.Namespace) -> Facts:
@@ -126,8 +121,7 @@ def _identify(args: argparse.Namespace) -> Facts:
         identified, facts = _with_multisine(identified, args)
     calibration = identified.calibration
     facts |= calibration_facts(calibration)
-    path = output_path_for(args.out, facts["verdict"])
-    save_calibration(path, calibration)
+    path = kept(args.out, calibration)
     facts["calibration"] = str(path)
     if args.equivalent_time:
         mode = fast_mode(motions[0])

@@ -1,11 +1,10 @@
 """Commands that split a lag into structural dynamics and latency: selfcal, reversal, latency."""
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from omsm_ros.cli.arguments import Arguments, cell_of, json_object, values_of
-from omsm_ros.cli.command import CliCommand, Facts, output_path_for, rejected, table, written
+from omsm_ros.cli.command import CliCommand, Facts, kept, rejected, table, written
 from omsm_ros.core.adjustment.resolved_calibration import undetermined
 from omsm_ros.core.adjustment.self_calibration import (
     DEFAULT_CLOCKING_RAD,
@@ -15,7 +14,7 @@ from omsm_ros.core.adjustment.self_calibration import (
 from omsm_ros.core.calibration.calibration import Calibration, excess_latency_text, with_latency
 from omsm_ros.core.calibration.latency import declared_latency, latency_summary
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.io.calibration_file import load_calibration, save_calibration
+from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.pipelines.study_scans import reversal_of, self_calibration_of
 from omsm_ros.quantities import (
     ANGLE_UNCERTAINTY,
@@ -47,7 +46,7 @@ def _selfcal(args: argparse.Namespace) -> Facts:
     names = ("harmonics", "clocking", "polarity", "static_gain", "gain_uncertainty", "settings")
     bags = [cell_of(path, args) for path in args.scans]
     found, made, accounts = self_calibration_of(bags, step_test, **values_of(args, *names))
-    path = _kept(args.out, made)
+    path = kept(args.out, made)
     return {
         **_resolved_facts(made),
         "residual": found.residual,
@@ -58,13 +57,6 @@ def _selfcal(args: argparse.Namespace) -> Facts:
         "samples": [account.as_dict() for account in accounts],
         "calibration": str(path),
     }
-
-
-def _kept(out: Path, calibration: Calibration) -> Path:
-    """Write the calibration, and return where."""
-    path = output_path_for(out, calibration.certificate.verdict or "")
-    save_calibration(path, calibration)
-    return path
 
 
 def _resolved_facts(calibration: Calibration) -> dict[str, Any]:
@@ -124,7 +116,7 @@ def _reversal(args: argparse.Namespace) -> Facts:
     facts["points"] = sum(account.axes.corrected for account in accounts)
     facts["samples"] = [account.as_dict() for account in accounts]
     if args.out:
-        facts["calibration"] = str(_kept(args.out, found.calibration))
+        facts["calibration"] = str(kept(args.out, found.calibration))
     return facts
 
 
@@ -163,7 +155,7 @@ def _latency(args: argparse.Namespace) -> Facts:
         raise ConfigurationError(wrong.code, **wrong.values)
     latency = declared_latency(lag, args.delay, args.uncertainty, args.reason)
     made = with_latency(calibration, latency)
-    path = _kept(args.out, made)
+    path = kept(args.out, made)
     return {**_resolved_facts(made), "calibration": str(path)}
 
 

@@ -56,27 +56,30 @@ def _declare_plan(add: Arguments) -> None:
     steps("--rise", RISE, "rise time of an edge [s]", default=20e-3)
     steps("--sharp", None)
     steps("--half-range", STEP, "half the measuring range of the probe [m]", default=50e-6)
-    _declare_scans(add.group("scans and motion"))
-    _declare_multisine(add.group("multisine"))
+    scans = add.group("scans and motion")
+    scans("--nominal", "SURFACE.yaml", "surface of the part")
+    scans("--sources", "SOURCES.yaml", "declared sources of the machine")
+    scans("--limits", "LIMITS.yaml", "of machine and probe")
+    scans("--accuracy", UNCERTAINTY, "expanded uncertainty asked for, k = 2 [m]", default=20e-9)
+    scans("--radius", LENGTH, "radius of the scan [m]; that of the surface's aperture, or 0.0127")
+    scans("--feed", LENGTH, "radial feed of a turn [m]", default=1e-4)
+    scans("--rpm", SPEED, "spindle speed of the first scan [1/min]", default=30.0)
+    scans("--path-error", UNCERTAINTY, "bound on Z of the executed path [m]", default=1e-7)
+    scans("--servo-period", SAMPLE_PERIOD, "cycle of the controller's planner [s]", default=1e-3)
+    multisine = add.group("multisine")
+    multisine("--resolution", FREQUENCY, "distance of its lines [Hz]", default=0.5)
+    multisine("--up-to", FREQUENCY, "highest line [Hz]", default=60.0)
+    multisine("--periods", COUNT, "periods that are evaluated of each realisation", default=3)
+    multisine("--realisations", COUNT, "number of sets of random phases", default=6)
+    multisine("--speed", RATE, "largest speed of Z [m/s]", default=5e-3)
+    multisine("--acceleration", ACCELERATION_LIMIT, "largest acceleration of Z [m/s²]", default=1.0)
+    multisine("--seed", COUNT, "of the random phases", default=1)
     motion = add.group("motion")
     motion("--calibration", "CAL.json", "whose modes are to be avoided")
     motion("--mode", FREQUENCY, "further modes of the machine [Hz]", nargs="+", default=[])
     motion("--line", FREQUENCY, "known vibrations [Hz]", nargs="+", default=[])
     motion("--marks", SPACING, "pitch of the rings that the tool left [m]", nargs="+", default=[])
     motion("--rate", FREQUENCY, nargs="+", default=[1000.0])
-
-
-def _declare_multisine(add: Arguments) -> None:
-    for name, kind, default, meaning in (
-        ("--resolution", FREQUENCY, 0.5, "distance of its lines [Hz]"),
-        ("--up-to", FREQUENCY, 60.0, "highest line [Hz]"),
-        ("--periods", COUNT, 3, "periods that are evaluated of each realisation"),
-        ("--realisations", COUNT, 6, "number of sets of random phases"),
-        ("--speed", RATE, 5e-3, "largest speed of Z [m/s]"),
-        ("--acceleration", ACCELERATION_LIMIT, 1.0, "largest acceleration of Z [m/s²]"),
-        ("--seed", COUNT, 1, "of the random phases"),
-    ):
-        add(name, kind, meaning, default=default)
 
 
 def _plan_multisine(args: argparse.Namespace) -> Facts:
@@ -133,26 +136,6 @@ def _show_plan(facts: Facts) -> None:
             written(facts["files"].values()),
         ]
     )
-
-
-def _declare_scans(add: Arguments) -> None:
-    add("--nominal", "SURFACE.yaml", "surface of the part")
-    add("--sources", "SOURCES.yaml", "declared sources of the machine")
-    add("--limits", "LIMITS.yaml", "of machine and probe")
-    for name, kind, default, meaning in (
-        ("--accuracy", UNCERTAINTY, 20e-9, "expanded uncertainty asked for, k = 2 [m]"),
-        (
-            "--radius",
-            LENGTH,
-            None,
-            "radius of the scan [m]; that of the surface's aperture, or 0.0127",
-        ),
-        ("--feed", LENGTH, 1e-4, "radial feed of a turn [m]"),
-        ("--rpm", SPEED, 30.0, "spindle speed of the first scan [1/min]"),
-        ("--path-error", UNCERTAINTY, 1e-7, "bound on Z of the executed path [m]"),
-        ("--servo-period", SAMPLE_PERIOD, 1e-3, "cycle of the controller's planner [s]"),
-    ):
-        add(name, kind, meaning, default=default)
 
 
 def _radius(args: argparse.Namespace, nominal: Surface) -> float:

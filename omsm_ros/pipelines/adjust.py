@@ -254,15 +254,13 @@ def write_adjustment(
             height = corrected_heights(found, scan.data, index)
             cloud.write(replace(scan.points, height=height))
     facts["files"] = {"adjustment": ADJUSTMENT, "cloud": ADJUSTED_CLOUD}
-    if report:
-        facts["files"]["report"] = REPORT
+    facts["files"] |= {"report": REPORT} if report else {}
     save_json(out / ADJUSTMENT, facts)
     if report:
         # Here, because drawing takes longer to load than scans to adjust.
         from omsm_ros.report.adjustment import render
 
-        date = now_text()
-        save_text(out / REPORT, render(title, facts, found, date))
+        save_text(out / REPORT, render(title, facts, found, now_text()))
 
 
 def adjustment_facts(
@@ -281,7 +279,19 @@ def adjustment_facts(
         "calibration": calibration.id,
         "verdict": verdict_entry(found.verdict, len(scans), doubts),
         "figures": figures_entry(found.form),
-        "scans": [_scan_entry(scan) for scan in scans],
+        "scans": [
+            {
+                "bag": scan.bag,
+                "speed_rpm": scan.data.speed / RPM_RAD_S,
+                "outward": scan.data.outward,
+                "turns": scan.data.turns,
+                "duration": scan.data.duration,
+                "clocking": scan.data.clocking,
+                "points": len(scan.data),
+                "samples": scan.account.as_dict(),
+            }
+            for scan in scans
+        ],
         "sources": [_source_entry(source) for source in found.sources],
         "agreement": [
             {"scan": a.scan, "peak_to_valley": a.pv, "rms": a.rms, "terms": a.terms.tolist()}
@@ -323,19 +333,6 @@ def figures_entry(form: FormMap) -> dict[str, Any]:
 
 def _figure(value: float, uncertainty: float) -> dict[str, float]:
     return {"value": float(value), "standard_uncertainty": float(uncertainty)}
-
-
-def _scan_entry(scan: AdjustedScan) -> dict[str, Any]:
-    return {
-        "bag": scan.bag,
-        "speed_rpm": scan.data.speed / RPM_RAD_S,
-        "outward": scan.data.outward,
-        "turns": scan.data.turns,
-        "duration": scan.data.duration,
-        "clocking": scan.data.clocking,
-        "points": len(scan.data),
-        "samples": scan.account.as_dict(),
-    }
 
 
 def _source_entry(source: SourceFinding) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Correct a recorded bag in one pass: blocks → core → cloud.ply and the figures of its summary."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -101,7 +102,9 @@ class CorrectedScan:
         most_traced: int = MOST_TRACED,
     ) -> None:
         self.path, self.options = recording.path, options
-        blocks = _blocks(recording, by_stamps)
+        blocks: Iterator[Any] = (block for _, block in recording.stream(*SCAN_TOPICS))
+        if by_stamps is not None:
+            blocks = _joined_by_stamps(blocks, by_stamps)
         first = next(blocks, None)
         if first is None:
             raise BagError(f"{str(self.path)!r} has no samples on {SCAN_TOPICS}; record a scan")
@@ -175,23 +178,13 @@ class CorrectedScan:
                 raise BagError(f"{str(self.path)!r} has no samples on {topic!r}; record a scan")
 
 
-def _blocks(recording: Recording, by_stamps: StampJoining | None) -> Iterator[Any]:
-    if by_stamps is not None:
-        yield from _joined_by_stamps(recording, by_stamps)
-        return
-    for _, block in recording.stream(*SCAN_TOPICS):
-        yield block
-
-
-def _joined_by_stamps(
-    recording: Recording, how: StampJoining
-) -> Iterator[AxisBlock | DistanceBlock]:
+def _joined_by_stamps(blocks: Iterator[Any], how: StampJoining) -> Iterator[Any]:
     """Yield the probe's blocks, and the axes interpolated to its samples.
 
     A message that repeats samples or comes late has no axes; the corrector counts its samples.
     """
     axes, distance = [], []
-    for _, block in recording.stream(*SCAN_TOPICS):
+    for block in blocks:
         (axes if isinstance(block, AxisBlock) else distance).append(block)
     moved = axes_at_probe(axes, distance, delay=how.delay, exposure=how.exposure)
     at_probe = next(moved, None)
@@ -200,12 +193,6 @@ def _joined_by_stamps(
             yield at_probe
             at_probe = next(moved, None)
         yield block
-
-
-LATERAL_SOURCES = (
-    "{names}: not in the uncertainty of the points, because the slopes of the surface are unknown; "
-    "give --nominal SURFACE.yaml"
-)
 
 
 # A quarter of an hour at 1 kHz, whose adjustment needs 1 GB; longer scans are not adjusted.
@@ -265,8 +252,12 @@ def with_lateral_errors(
         return done
     points = done.trace.points()
     if not resolves_per_turn_waves(points):
-        names = ", ".join(dict.fromkeys(source.name for source in sources))
-        return replace(done, faults=(*done.faults, LATERAL_SOURCES.format(names=names)))
+        left_out = (
+            f"{', '.join(dict.fromkeys(source.name for source in sources))}: not in the "
+            "uncertainty of the points, because the slopes of the surface are unknown; give "
+            "--nominal SURFACE.yaml"
+        )
+        return replace(done, faults=(*done.faults, left_out))
     by_source = standard_fields(sources, points.with_slopes(None))
     fields = scan_fields(by_source, done.trace.every)
     kept, largest = EvenSelection(most), 0.0
@@ -320,7 +311,7 @@ def correct_bag(
                     if nominal is not None and lateral:
                         points = with_lateral_uncertainty(points, nominal, lateral)
                     found.add(points, ply.write(points))
-        return with_lateral_errors(_correction(scan, found), cloud, scan.options)
+        return with_lateral_errors(found.correction(scan), cloud, scan.options)
 
 
 class _RunningResults:
@@ -408,33 +399,26 @@ class _RunningResults:
             self._running["corrected"].add(x, y, corrected)
             self._running["raw"].add(x, y, corrected + error)
 
-    def scan(self, period: float) -> ScanData | None:
-        try:
-            return scan_data(self._blocks, self._points, period)[0] if self._points else None
-        except DataError:
-            return None
-
-    def statistics(self) -> dict[str, FormStatistics]:
-        if not len(self.drawn):
-            return {}
-        return {name: running.statistics() for name, running in self._running.items()}
-
-
-def _correction(scan: CorrectedScan, found: _RunningResults) -> Correction:
-    return Correction(
-        account=scan.account.as_dict(),
-        budget=scan.corrector.budget,
-        stamp_skew=scan.corrector.stamp_skew,
-        admission=scan.admitted,
-        reasons=scan.reasons,
-        statistics=found.statistics(),
-        largest_uncertainty=found.largest,
-        points=found.drawn.rows(),
-        trace=scan.corrector.trace,
-        path=found.path.path(),
-        sample_period=scan.sample_period,
-        recorded_ns=scan.recorded_ns,
-        temperatures=scan.temperatures,
-        faults=found.faults(scan),
-        scan=found.scan(scan.sample_period),
-    )
+    def correction(self, scan: CorrectedScan) -> Correction:
+        """Return the result of the whole pass."""
+        running = self._running.items() if len(self.drawn) else ()
+        data, period = None, scan.sample_period
+        with suppress(DataError):  # points that make no scan
+            data = scan_data(self._blocks, self._points, period)[0] if self._points else None
+        return Correction(
+            account=scan.account.as_dict(),
+            budget=scan.corrector.budget,
+            stamp_skew=scan.corrector.stamp_skew,
+            admission=scan.admitted,
+            reasons=scan.reasons,
+            statistics={name: one.statistics() for name, one in running},
+            largest_uncertainty=self.largest,
+            points=self.drawn.rows(),
+            trace=scan.corrector.trace,
+            path=self.path.path(),
+            sample_period=period,
+            recorded_ns=scan.recorded_ns,
+            temperatures=scan.temperatures,
+            faults=self.faults(scan),
+            scan=data,
+        )

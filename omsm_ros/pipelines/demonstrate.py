@@ -48,7 +48,7 @@ from omsm_ros.pipelines.publish import publish_scan
 from omsm_ros.pipelines.record_bags import NOMINAL, write_nominal
 from omsm_ros.readable import now_text, quantity
 from omsm_ros.report.verdict import headline
-from omsm_ros.twin.cell import Probe, Recording, compare_with_truth
+from omsm_ros.twin.cell import Probe, compare_with_truth
 from omsm_ros.twin.disturbances import Disturbances, TrueResponse
 from omsm_ros.twin.part import FigureError
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of, verifying
@@ -249,8 +249,13 @@ def finish_demonstration(plan: Demonstration) -> dict[str, Any]:
     measurement.add_verdict(summary, done, calibration, judgement)
     summary["files"] |= {"scan_report": SCAN_REPORT}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
-    summary |= truth_entries(recording, cloud)  # replaces the estimated error by the true one
-    true = true_response(step_test)
+    # Replaces the estimated error by the true one.
+    summary |= compare_with_truth(
+        recording, cloud["sample"], cloud["height"], cloud["dynamic_error"].astype(np.float64)
+    )
+    probe, true = Probe(), step_test.truth.response
+    floor = float(np.hypot(probe.noise, probe.resolution / np.sqrt(12)))
+    summary["surface_deviation"]["probe_noise_and_resolution"] = floor
     summary["response"] = response_errors(calibration, true)
     live = live_points(plan.bag)
     summary["live_equals_offline"] = same_points(live, cloud)
@@ -312,24 +317,6 @@ def form_truth(part: FigureError, found: Adjustment) -> dict[str, float]:
     }
 
 
-def truth_entries(recording: Recording, cloud: NDArray[np.void]) -> dict[str, Any]:
-    """Return the entries of the summary that need the true values; lengths in metres."""
-    entries: dict[str, Any] = compare_with_truth(
-        recording, cloud["sample"], cloud["height"], cloud["dynamic_error"].astype(np.float64)
-    )
-    probe = Probe()
-    floor = float(np.hypot(probe.noise, probe.resolution / np.sqrt(12)))
-    entries["surface_deviation"]["probe_noise_and_resolution"] = floor
-    return entries
-
-
-def true_response(recording: Recording) -> TrueResponse:
-    """Return the true response that an identification estimates."""
-    if recording.truth is None:
-        raise OmsmError("the recording holds no true values; record it on the twin")
-    return recording.truth.response
-
-
 def response_errors(calibration: Calibration, true: TrueResponse) -> list[dict[str, float]]:
     """Compare the identified with the true response: relative gain error [1], phase error [deg]."""
     frequency = np.array(RESPONSE_FREQUENCIES_HZ)
@@ -371,19 +358,13 @@ def sample_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
         reasons = "".join(f", {n} {reason}" for reason, n in account["counted"].items() if n)
         value = f"{account['received']} received, {account['corrected']} corrected{reasons}"
         yield f"samples of {stream}", value
-    yield "live cloud equals offline", _live_text(summary)
-
-
-def _live_text(summary: dict[str, Any]) -> str:
-    if summary["live_equals_offline"]:
-        return "to the last bit"
     left_out = summary["samples"]["distance"]["corrected"] - summary["live_points"]
-    if left_out <= 0:
-        return "NO"
-    return (
-        f"NO: {left_out} points are missing live because this computer was too slow; give a "
+    late = (
+        f": {left_out} points are missing live because this computer was too slow; give a "
         "smaller --time-lapse"
     )
+    live = "to the last bit" if summary["live_equals_offline"] else "NO" + late * (left_out > 0)
+    yield "live cloud equals offline", live
 
 
 def _accuracy_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:

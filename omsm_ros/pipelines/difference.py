@@ -1,6 +1,6 @@
 """Compare two measurements of one part, also of another instrument: task and files."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,12 @@ from omsm_ros.core.comparison.agreement import (
 from omsm_ros.core.comparison.compare import Comparison, SideSummary, compare_measurements_of_part
 from omsm_ros.core.comparison.matching import SEATED
 from omsm_ros.core.comparison.resampling import RADIUS_CELLS, TREND_DEGREE
-from omsm_ros.core.comparison.stated_errors import ComparedMeasurement, ErrorFields
+from omsm_ros.core.comparison.stated_errors import ComparedMeasurement
 from omsm_ros.core.correction.systematic import ScanFields
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.placement import Placed, PointBatch, placed
-from omsm_ros.core.registration.pose_parameters import Registration
 from omsm_ros.core.registration.register import register
-from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.deviation import deviation
 from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
@@ -31,6 +30,7 @@ from omsm_ros.io.folders import read_result
 from omsm_ros.io.maps.columns_file import write_columns
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.results import load_fields
+from omsm_ros.pipelines.form import point_batches
 from omsm_ros.readable import now_text
 from omsm_ros.units import LengthUnits
 
@@ -204,8 +204,16 @@ def _terms(agreement: ComparisonAgreement | None) -> dict[str, Any] | None:
     }
 
 
-_REGISTERED_PORTION = 65_536
 POSE = "pose of the part"
+
+
+@dataclass(frozen=True, eq=False)
+class _FieldsAfterFit:
+    """Fields of errors after the fit of the pose; ``at`` computes them, as that of ScanFields."""
+
+    names: tuple[str, ...]
+    at: Callable[[int, int], FloatArray]
+    aligned: tuple[str, ...] = ()  # none of a pose: errors of two poses are independent
 
 
 def registered(
@@ -222,90 +230,38 @@ def registered(
     names = fields.names if fields is not None else ()
 
     def portions() -> Iterator[PointBatch]:
-        for first in range(0, len(points), _REGISTERED_PORTION):
-            part = slice(first, first + _REGISTERED_PORTION)
-            x, y, height = points.x[part], points.y[part], points.height[part]
-            effects = np.empty((0, len(x))) if fields is None else fields.at(first, len(x))
-            yield PointBatch(x, y, height, effects)
+        return point_batches(points, fields)
 
     found = register(nominal, portions, dofs, sources=names, even=as_grid(points) is not None)
     where = [placed(nominal, found.placement, portion) for portion in portions()]
     whole = Placed(*(np.concatenate(parts, axis=-1) for parts in zip(*where, strict=True)))
     kept = np.flatnonzero(np.isfinite(whole.deviation) & found.good(0, len(points)))
-    placed_points = whole.part(kept)
-    return replace(
-        m,
-        points=_points(points, placed_points, kept, found),
-        fields=None if fields is None else _RegisteredFields(found, placed_points, kept, fields),
-        pose=_PoseFields(found, placed_points),
-    )
+    part = whole.part(kept)
+    held = 2 * len(found.held_effects)
 
+    def effects(first: int, count: int, systematic: FloatArray) -> tuple[FloatArray, FloatArray]:
+        here = Placed(*(values[..., first : first + count] for values in part))
+        return found.effects(here, systematic)
 
-def _points(
-    points: MeasuredPoints, at: Placed, kept: IntArray, found: Registration
-) -> MeasuredPoints:
-    note = "registered by " + ", ".join(
-        f"{name} {found.placement.value(name):.4g}" for name in found.dofs.fitted
-    )
-    left_out = len(points) - len(kept)
-    return replace(
-        points.part(kept),
-        x=at.x,
-        y=at.y,
-        height=at.deviation,
-        notes=(*points.notes, note, *([f"{left_out} points left out"] if left_out else ())),
-    )
+    def of_scan(first: int, count: int) -> FloatArray:
+        chosen = kept[first : first + count]
+        low, end = (int(chosen[0]), int(chosen[-1]) + 1) if len(chosen) else (0, 0)
+        rows = fields.at(low, end - low) if fields is not None else np.empty((0, end - low))
+        return effects(first, count, rows[:, chosen - low])[1][: len(rows)]
 
-
-@dataclass(frozen=True, eq=False)
-class _RegisteredFields:
-    """Fields of a scan's errors after the fit of the pose."""
-
-    found: Registration
-    at_: Placed
-    kept: IntArray
-    fields: ErrorFields
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.fields.names
-
-    @property
-    def aligned(self) -> tuple[str, ...]:
-        return self.fields.aligned
-
-    def at(self, first: int, count: int) -> FloatArray:
-        """Return the fields (s, count) [m] of the kept points from ``first`` on."""
-        chosen = self.kept[first : first + count]
-        low = int(chosen[0]) if len(chosen) else 0
-        rows = self.fields.at(low, int(chosen[-1]) - low + 1 if len(chosen) else 0)
-        part = _slice(self.at_, first, count)
-        return self.found.effects(part, rows[:, chosen - low])[1][: len(rows)]
-
-
-@dataclass(frozen=True, eq=False)
-class _PoseFields:
-    """Fields of the uncertainty of the pose, one row for each independent component."""
-
-    found: Registration
-    at_: Placed
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return (POSE,) * (len(self.found.pose_effects) + 2 * len(self.found.held_effects))
-
-    @property
-    def aligned(self) -> tuple[str, ...]:
-        """Return no names: errors of two poses are independent."""
-        return ()
-
-    def at(self, first: int, count: int) -> FloatArray:
-        """Return the fields (p, count) [m] of the kept points from ``first`` on."""
-        part = _slice(self.at_, first, count)
-        none = np.zeros((self.found.moved.shape[1] - 2 * len(self.found.held_effects), len(part.x)))
-        pose, sources = self.found.effects(part, none)
+    def of_pose(first: int, count: int) -> FloatArray:
+        none = np.zeros((found.moved.shape[1] - held, len(part.x[first : first + count])))
+        pose, sources = effects(first, count, none)
         return np.concatenate([pose, sources[len(none) :]])
 
-
-def _slice(at: Placed, first: int, count: int) -> Placed:
-    return Placed(*(values[..., first : first + count] for values in at))
+    moved = ", ".join(f"{name} {found.placement.value(name):.4g}" for name in found.dofs.fitted)
+    left_out = [f"{len(points) - len(kept)} points left out"] * (len(points) > len(kept))
+    return replace(
+        m,
+        points=replace(
+            points.part(kept), x=part.x, y=part.y, height=part.deviation,
+            notes=(*points.notes, f"registered by {moved}", *left_out),
+        ),
+        fields=fields and _FieldsAfterFit(names, of_scan, fields.aligned),
+        pose=_FieldsAfterFit((POSE,) * (len(found.pose_effects) + held), of_pose),
+    )  # fmt: skip

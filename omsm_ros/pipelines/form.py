@@ -1,13 +1,13 @@
 """From a cloud and a nominal surface to ``form.json``."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.correction.systematic import ScanFields
+from omsm_ros.core.comparison.stated_errors import ErrorFields
 from omsm_ros.core.form.analyse import FormResult, analyse_form
 from omsm_ros.core.form.deviation_map import UncertainValue, conformity
 from omsm_ros.core.form.drawing import Drawing
@@ -30,7 +30,7 @@ from omsm_ros.readable import quantity
 from omsm_ros.report.verdict import headline
 from omsm_ros.units import NOT_USED, LengthUnits
 
-_PORTION = 131_072
+_PORTION, _PLACES = 131_072, ("x", "y", "height")
 _CORRECTION = "stated with the correction, for the whole scan and all sources of uncertainty"
 
 
@@ -113,31 +113,36 @@ def open_measurement(
         points = without_duplicates(read_points(file, units, channel))
         gridded = as_grid(points) is not None
         return OpenedMeasurement(
-            lambda: _slices(points), (), False, points.notes, gridded, missing=points.missing
+            lambda: point_batches(points), (), False, points.notes, gridded, missing=points.missing
         )
     notes = () if units in (None, LengthUnits(1.0, 1.0)) else (NOT_USED,)
     if (summary := summary_of_points(path)) and summary.get("figures"):
         notes += (f"{_CORRECTION}: {headline(summary)}",)
     fields_path = file.with_name(SYSTEMATIC)
     fields = load_fields(fields_path) if fields_path.is_file() else None
-    if fields is None:
-        return OpenedMeasurement(lambda: _portions(cloud, None), (), False, notes)
-    return OpenedMeasurement(
-        lambda: _portions(cloud, fields), fields.names, True, notes, bounds=fields.bounds
-    )
+    names, bounds = (fields.names, fields.bounds) if fields is not None else ((), ())
+
+    def portions() -> Iterator[PointBatch]:
+        parts = cloud.portions(_PORTION)
+        return _batches(([rows[name] for name in _PLACES] for rows in parts), fields)
+
+    return OpenedMeasurement(portions, names, fields is not None, notes, bounds=bounds)
 
 
-def _slices(points: MeasuredPoints) -> Iterator[PointBatch]:
-    for first in range(0, len(points), _PORTION):
-        part = slice(first, first + _PORTION)
-        x, y, height = points.x[part], points.y[part], points.height[part]
-        yield PointBatch(x, y, height, np.empty((0, len(x))))
+def point_batches(
+    points: MeasuredPoints, fields: ErrorFields | None = None
+) -> Iterator[PointBatch]:
+    """Yield the points in batches with the effects of the ``fields`` of systematic errors."""
+    columns, starts = [getattr(points, n) for n in _PLACES], range(0, len(points), _PORTION)
+    return _batches(([v[first : first + _PORTION] for v in columns] for first in starts), fields)
 
 
-def _portions(cloud: CloudFile, fields: ScanFields | None) -> Iterator[PointBatch]:
+def _batches(
+    parts: Iterable[Sequence[FloatArray]], fields: ErrorFields | None
+) -> Iterator[PointBatch]:
     first = 0
-    for rows in cloud.portions(_PORTION):
-        x, y, height = (rows[name].astype(np.float64) for name in ("x", "y", "height"))
+    for part in parts:
+        x, y, height = (values.astype(np.float64) for values in part)
         effects = np.empty((0, len(x))) if fields is None else fields.at(first, len(x))
         yield PointBatch(x, y, height, effects)
         first += len(x)

@@ -49,7 +49,7 @@ class Catalogue:
     def __init__(self, address: str) -> None:
         self.address = address if "://" in address else f"{_SQLITE}{address}"
         kind = self.address.partition("://")[0]
-        if kind not in _KINDS or not _is_text(address):
+        if kind not in _KINDS or address.encode(errors="replace").decode() != address:
             raise ConfigurationError(
                 f"catalogue {shown(address)}, expected a file, sqlite:///FILE or postgresql://…, "
                 "in UTF-8"
@@ -82,18 +82,14 @@ class Catalogue:
             )
             if sqlite:
                 sqlalchemy.event.listen(self._engine, "connect", _bounded)
-            self._make_tables()
+            for table in self._tables.values():
+                try:
+                    table.create(self._engine, checkfirst=True)
+                except sqlalchemy.exc.DBAPIError as err:
+                    # Another process may create it at the same time.
+                    if "already exists" not in str(err):
+                        raise
         return self
-
-    def _make_tables(self) -> None:
-        known = self._tables["calibrations"].metadata
-        try:
-            known.create_all(self._engine, checkfirst=True)
-        except self._sql.exc.DBAPIError as err:
-            if "already exists" not in str(err):
-                raise
-            # Another process created them at the same time, so look again.
-            known.create_all(self._engine, checkfirst=True)
 
     def __exit__(self, *_: object) -> None:
         self._engine.dispose()
@@ -148,16 +144,12 @@ class Catalogue:
                 f"catalogue: {exception_text(err)}; pip install psycopg[binary]"
             ) from err
         except Exception as err:  # the library raises many kinds
+            # The text of the database, without the statement and the link to a manual.
+            text = str(err).partition("[SQL")[0].partition("(Background")[0]
             raise FileError(
-                f"catalogue {self._shown_address()!r}: {self._reason(err)}; "
+                f"catalogue {self._shown_address()!r}: {' '.join(text.split())[:200]}; "
                 "check that it is there and may be written"
             ) from err
-
-    @staticmethod
-    def _reason(err: Exception) -> str:
-        """Return the text of the database, without the statement and the link to a manual."""
-        text = str(err).partition("[SQL")[0].partition("(Background")[0]
-        return " ".join(text.split())[:200]
 
     def _shown_address(self) -> str:
         try:
@@ -165,15 +157,6 @@ class Catalogue:
         except (ValueError, self._sql.exc.ArgumentError):
             return self.address.rpartition("@")[2]  # invalid, and may contain a password
         return str(url.render_as_string(hide_password=True))
-
-
-def _is_text(address: str) -> bool:
-    """Whether it is Unicode; the name of a file may be any bytes, an address may not."""
-    try:
-        address.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _check(name: str, kind: type, values: Sequence[object]) -> None:
@@ -259,7 +242,7 @@ def keep_calibration(
     """
     row = {
         "id": calibration.id,
-        "recorded_at": time_of(recorded_ns or _recorded(source)),
+        "recorded_at": time_of(recorded_ns or recorded_ns_of(source)),
         "machine": _machine(calibration.settings),
         "verdict": verdict_text(calibration),
         "path": str(path.absolute()),
@@ -291,7 +274,7 @@ def keep_measurement(address: str, folder: Path, bag: Path | None = None) -> boo
     place = str(folder.absolute())
     row = {
         "id": hashlib.sha256(f"{place}\0{text}".encode()).hexdigest(),
-        "recorded_at": time_of(_recorded(source)),
+        "recorded_at": time_of(recorded_ns_of(source)),
         "machine": _machine(settings),
         "bag": str(source.absolute()),
         "folder": place,
@@ -389,7 +372,8 @@ def _count(value: object) -> int | None:
     return value if isinstance(value, int) and 0 <= value <= COUNTER.high else None
 
 
-def _recorded(bag: Path | None) -> int | None:
+def recorded_ns_of(bag: Path | None) -> int | None:
+    """Return when a bag was recorded [ns, ROS time], None if it does not say or is not there."""
     try:
         if bag is None or not bag.exists():
             return None

@@ -15,12 +15,11 @@ from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import Identification
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import CalibrationError, DataError, FileError, named_errors
-from omsm_ros.io.descriptions import load_motion
 from omsm_ros.io.files import load_object, save_bytes, save_json
 from omsm_ros.io.folders import result_folder
 from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
 from omsm_ros.io.tables.text_table import PLAIN, TextTable, load_columns
-from omsm_ros.pipelines.recording import Recording
+from omsm_ros.pipelines.recording import scan_path_of
 from omsm_ros.readable import now_text, quantity
 from omsm_ros.units import seconds_of
 
@@ -34,11 +33,7 @@ def intended_use_of(scan: Path | None, accuracy: float | None) -> IntendedUse:
     """
     if scan is None:
         return replace(PAPER_USE, accuracy_m=accuracy)
-    if scan.suffix.lower() == ".csv":
-        z, period = load_motion(scan)
-        return use_of_motion(z, period, accuracy)
-    with Recording(scan) as recording:
-        path = recording.scan_path()
+    path = scan_path_of(scan)
     return use_of_motion(path.z, path.sample_period, accuracy)
 
 

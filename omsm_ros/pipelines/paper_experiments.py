@@ -23,8 +23,9 @@ from omsm_ros.pipelines.record_bags import write_recording
 from omsm_ros.pipelines.spectrum import SpectrumOfScan, SpectrumOptions, spectra_of, summary_of
 from omsm_ros.pipelines.verify_calibration import path_check_of
 from omsm_ros.readable import plain, quantity
-from omsm_ros.report.experiments import Compared, Done, Panel, compared, done, panels, psd
+from omsm_ros.report.experiments import Compared, Done, compared, done, psd
 from omsm_ros.report.spectrum import CAPTIONS, drawn
+from omsm_ros.report.style import Panel, panels
 from omsm_ros.report.tables import Table
 from omsm_ros.twin.cell import Cell, Probe, Recording, record
 from omsm_ros.twin.disturbances import Disturbances, VibrationLine

@@ -26,9 +26,10 @@ from omsm_ros.pipelines.measure import measure
 from omsm_ros.pipelines.publish import view_of
 from omsm_ros.pipelines.record_bags import write_recording
 from omsm_ros.readable import plain, quantity
-from omsm_ros.report.experiments import Compared, Done, Panel, compared, done, panels, psd
+from omsm_ros.report.experiments import Compared, Done, compared, done, psd
 from omsm_ros.report.measurement.figures import levelled, profile_cuts, surface_figures
 from omsm_ros.report.measurement.page import CAPTIONS as SCAN_CAPTIONS
+from omsm_ros.report.style import Panel, panels
 from omsm_ros.report.tables import Table
 from omsm_ros.twin.cell import Recording
 from omsm_ros.twin.plant import PAPER_DYNAMICS, PAPER_STATIC_GAIN

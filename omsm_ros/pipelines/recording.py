@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from omsm_ros.core.streams.stamps import check_period
 from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.io import bags
+from omsm_ros.io.descriptions import load_motion
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.progress import state_progress
 from omsm_ros.quantities import TIME_LAPSE
@@ -131,6 +133,18 @@ class Recording:
             by_stamps=by_stamps,  # type: ignore[arg-type]
             further=further,
         )
+
+
+def scan_path_of(scan: AnyBag) -> ScanPath:
+    """Return the motion in a bag, or in a plan in CSV with columns time_s and z_m.
+
+    Raises FileError, BagError or ConfigurationError.
+    """
+    if isinstance(scan, Path) and scan.suffix.lower() == ".csv":
+        z, period = load_motion(scan)
+        return ScanPath(z=z, sample_period=period)
+    with Recording(scan) as recording:
+        return recording.scan_path()
 
 
 def scan_data(

@@ -96,13 +96,8 @@ def source_table(facts: Mapping[str, Any]) -> Table:
     """Return each source that was declared or is significant: declared against found."""
     shown = [s for s in facts["sources"] if s["declared"] is not None or s["refuted"]]
     shown.sort(key=lambda s: -(s["effect"] or 0.0))
-    rows = [
-        (source["text"], declared_text(source), found_text(source), effect_text(source),
-         _status(source))
-        for source in shown
-    ]  # fmt: skip
     heads = ("declared (k = 1)", "found (k = 1)", "effect on the heights, rms (k = 1)", "")
-    return Table("", heads, rows)
+    return Table("", heads, [(s["text"], _declared(s), *_found(s), _status(s)) for s in shown])
 
 
 def tested_text(facts: Mapping[str, Any]) -> str:
@@ -111,35 +106,28 @@ def tested_text(facts: Mapping[str, Any]) -> str:
     return f"{count(others)} further effects were tested; none is significant"
 
 
-def declared_text(source: Mapping[str, Any]) -> str:
+def _declared(source: Mapping[str, Any]) -> str:
     """Return the declared standard uncertainty, or that there is none."""
-    declared = source["declared"]
-    if declared is None:
+    if source["declared"] is None:
         return "not declared"
-    added = " with that of the calibration" if source["name"] in WITH_CALIBRATION else ""
-    return f"{sized(declared, source['unit'], 2)}{added}"
+    added = " with that of the calibration" * (source["name"] in WITH_CALIBRATION)
+    return f"{sized(source['declared'], source['unit'], 2)}{added}"
+
+
+def _found(source: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the found value and its effect on the heights, or that these scans do not show it."""
+    if not source["identifiable"]:
+        return "not identifiable from these scans", NOTHING
+    # A declaration holds for one component, so the mean square over the components is compared.
+    size, spread = (float(np.sqrt(np.mean(np.square(source[k])))) for k in ("found", "uncertainty"))
+    return (
+        measured(size, spread, "" if source["unit"] == "1" else source["unit"]),
+        measured(source["effect"], source["effect_uncertainty"], "m"),
+    )
 
 
 def _status(source: Mapping[str, Any]) -> str:
-    if not source["refuted"]:
-        return ""
-    return "refuted" if source["declared"] is not None else "significant"
-
-
-def found_text(source: Mapping[str, Any]) -> str:
-    """Return the found value with its uncertainty, or that these scans do not show it."""
-    if not source["identifiable"]:
-        return "not identifiable from these scans"
-    # A declaration holds for one component, so the mean square over the components is compared.
-    size, spread = (float(np.sqrt(np.mean(np.square(source[k])))) for k in ("found", "uncertainty"))
-    return measured(size, spread, "" if source["unit"] == "1" else source["unit"])
-
-
-def effect_text(source: Mapping[str, Any]) -> str:
-    """Return the effect of the found value on the heights, if these scans show it."""
-    if not source["identifiable"]:
-        return NOTHING
-    return measured(source["effect"], source["effect_uncertainty"], "m")
+    return ("significant" if source["declared"] is None else "refuted") * source["refuted"]
 
 
 def _scans(facts: Mapping[str, Any]) -> Table:

@@ -4,26 +4,24 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from omsm_ros.core.comparison.agreement import COVERAGE_FACTOR, ComparedTerm
 from omsm_ros.core.comparison.compare import Comparison
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.core.surface.deviation import Profile, line_profile, radial_profile
 from omsm_ros.readable import NOTHING, count, figure, percent, plain, probability, quantity
 from omsm_ros.report import style
+from omsm_ros.report.measurement.figures import PROFILES, UNITS_M, cuts, profile
 from omsm_ros.report.measurement.surface_map import EmbeddedMap, Layer, embedded, policy_of, script
 from omsm_ros.report.page_parts import Headline, fill, picture
 from omsm_ros.report.tables import POSE_UNITS, Table
 from omsm_ros.report.verdict import PageVerdict
-from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
 # Half width of a profile's band, and length of its segments, in grid spacings.
 _HALF_WIDTH_CELLS, _SEGMENT_CELLS = 1.5, 1.5
 # Numbers on an axis have at most four digits.
 _LARGEST_NUMBER = 5000
-_LINES = {"profile_x": (0.0, "along x", "x"), "profile_y": (np.pi / 2, "along y", "y")}
+_UNITS = ("nm", "µm", "mm")
 
 
 def profiles(found: Comparison) -> dict[str, Figure]:
@@ -31,57 +29,24 @@ def profiles(found: Comparison) -> dict[str, Figure]:
     matched, agreement = found.matched, found.agreement
     side = matched.grid.dx
     x0, y0 = ((float(v.min()) + float(v.max())) / 2 for v in (matched.x, matched.y))
-    x, y = matched.x - x0, matched.y - y0
     a, b = matched.without_fit(np.stack([matched.a, matched.b]))
-    spread = None if agreement is None else agreement.uncertainty
-    shown = (a, b, matched.difference)
+    shown = {"A": a, "B": b, "A − B": matched.difference}
+    if agreement is not None:
+        shown["u"] = agreement.uncertainty
+    widths = _HALF_WIDTH_CELLS * side, _SEGMENT_CELLS * side, 2 * side
     made = {}
-    for name, (angle, title, position) in _LINES.items():
-
-        def line(values: FloatArray, angle: float = angle) -> Profile:
-            return line_profile(
-                x, y, values, angle=angle,
-                half_width=_HALF_WIDTH_CELLS * side, spacing=_SEGMENT_CELLS * side,
+    for name, cut in cuts(matched.x - x0, matched.y - y0, shown, *widths).items():
+        if name in CAPTIONS and len(cut["A"].position):
+            above = {n: cut[n] for n in "AB"}
+            largest = max(float(np.nanmax(np.abs(c.value), initial=0.0)) for c in above.values())
+            units = (u for u in _UNITS if largest < _LARGEST_NUMBER * UNITS_M[u])
+            title, position = PROFILES[name]
+            made[name] = profile(
+                above, cut["A − B"], title=title, position=position, unit=next(units, "mm"),
+                height="height", lower=("A − B", style.TRUTH),
+                band=None if name == "profile_radius" else cut.get("u"),
             )  # fmt: skip
-
-        cuts = [line(values) for values in shown]
-        band = None if spread is None else line(spread)
-        if len(cuts[0].position):
-            made[name] = _profile(cuts, band, f"Profile {title}", position)
-    rings = [radial_profile(x, y, values, spacing=2 * side) for values in shown]
-    if len(rings[0].position):
-        made["profile_radius"] = _profile(rings, None, "Mean over each ring", "radius")
     return made
-
-
-def _profile(cuts: Sequence[Profile], band: Profile | None, title: str, position: str) -> Figure:
-    made, axes = style.figure(6.1, 3.6, rows=2, sharex=True)
-    upper, lower = axes[:, 0]
-    unit, name_of_unit = _unit(cuts[:2])
-    for cut, colour, name in zip(cuts, (style.BEFORE, style.AFTER), "AB", strict=False):
-        _line(upper, cut, unit, color=colour, label=name)
-    _line(lower, cuts[2], NANOMETRE_M, color=style.TRUTH, label="A − B")
-    if band is not None:
-        bound = COVERAGE_FACTOR * band.value / NANOMETRE_M
-        lower.fill_between(
-            band.position / MILLIMETRE_M, -bound, bound, color=style.AFTER, alpha=0.18,
-            linewidth=0, label="±U of a point, k = 2",
-        )  # fmt: skip
-    style.legend_above(upper)
-    style.legend_above(lower)
-    style.label(upper, y=f"height [{name_of_unit}]", title=title)
-    style.label(lower, x=f"{position} [mm]", y="A − B [nm]")
-    return made
-
-
-def _unit(cuts: Sequence[Profile]) -> tuple[float, str]:
-    largest = max(float(np.nanmax(np.abs(cut.value), initial=0.0)) for cut in cuts)
-    units = ((NANOMETRE_M, "nm"), (MICROMETRE_M, "µm"), (MILLIMETRE_M, "mm"))
-    return next((u for u in units if largest < _LARGEST_NUMBER * u[0]), units[-1])
-
-
-def _line(axes: Axes, drawn: Profile, unit: float, **look: str) -> None:
-    axes.plot(drawn.position / MILLIMETRE_M, drawn.value / unit, linewidth=1.1, **look)
 
 
 def terms(numbers: Sequence[ComparedTerm]) -> Figure:

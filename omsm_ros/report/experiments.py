@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from omsm_ros.core.ripple.density import density
@@ -70,38 +69,6 @@ def done(
         "the dynamics of the paper's Eq. 12, corrected for a missing s.",
     )
     return Done(facts, rows, fill_study(page))
-
-
-# Ratio of the ends of a logarithmic axis below which powers of ten alone are too few numbers.
-_NARROW = 30.0
-
-
-class Panel(NamedTuple):
-    """One panel of a figure: curves (x, y) by name; ``log``: logarithmic axes, "", "x" or "xy"."""
-
-    title: str
-    x: str
-    y: str
-    curves: Mapping[str, tuple[FloatArray, FloatArray]]
-    log: str = ""
-
-
-def panels(*shown: Panel) -> Figure:
-    """Draw panels one below the other."""
-    made, axes = style.figure(9.2, 2.5 * len(shown) + 0.3, len(shown), 1)
-    colours = (style.BEFORE, style.AFTER, style.TRUTH, style.MUTED)
-    for ax, panel in zip(axes[:, 0], shown, strict=True):
-        for (name, (x, y)), colour in zip(panel.curves.items(), colours, strict=False):
-            ax.plot(x, y, linewidth=0.8, color=colour, label=name)
-        for k, name in enumerate(panel.log):
-            values = np.concatenate([curve[k] for curve in panel.curves.values()])
-            narrow = np.max(values) < _NARROW * np.min(values)
-            axis = getattr(ax, f"{name}axis")
-            style.logarithmic(axis, every=(1.0, 2.0, 5.0) if narrow else (1.0,))
-        style.label(ax, x=panel.x, y=panel.y, title=panel.title)
-        if len(panel.curves) > 1:
-            style.legend_above(ax)
-    return made
 
 
 def psd(values: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:

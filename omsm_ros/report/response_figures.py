@@ -28,11 +28,6 @@ class HasResponse(Protocol):
         ...
 
 
-def frequencies(identified: Calibration) -> FloatArray:
-    """Return frequencies of a Bode plot [Hz], up to the Nyquist frequency of the data."""
-    return np.geomspace(_LOWEST_HZ, 0.5 / identified.sample_period, 600)
-
-
 def bode(identified: Calibration, true: HasResponse | None, sample_period: float) -> Figure:
     """Draw gain, phase, and the error of a motion before and after the correction.
 
@@ -59,7 +54,7 @@ def draw_gain(
     """Draw |G_m| with its 95 % band."""
     magnitude = np.abs(identified.dynamics.response(frequency))
     band = np.exp(np.minimum(COVERAGE_FACTOR * _band(identified, frequency).gain, _WIDEST))
-    _draw_band(axes, frequency, magnitude / band, magnitude, magnitude * band)
+    draw_band(axes, frequency, magnitude / band, magnitude, magnitude * band)
     if true is not None:
         _draw_true(axes, frequency, np.abs(true.response(frequency)))
     _frequency_axis(axes, frequency, identified)
@@ -83,7 +78,7 @@ def draw_phase(
     """Draw the phase of G_m [deg] with its 95 % band."""
     angle = _phase(identified.dynamics, frequency)
     band = COVERAGE_FACTOR * _band(identified, frequency).phase / DEGREE_RAD
-    _draw_band(axes, frequency, angle - band, angle, angle + band)
+    draw_band(axes, frequency, angle - band, angle, angle + band)
     if true is not None:
         _draw_true(axes, frequency, _phase(true, frequency))
     _frequency_axis(axes, frequency, identified)
@@ -128,9 +123,10 @@ def _draw_error(
     style.label(axes, x="frequency of the motion [Hz]", y="error per motion [nm/µm]")
 
 
-def _draw_band(
+def draw_band(
     axes: Axes, frequency: FloatArray, low: FloatArray, middle: FloatArray, high: FloatArray
 ) -> None:
+    """Draw a curve (n,) over frequency [Hz], and its band if there is any."""
     if np.any(high > low):
         axes.fill_between(
             frequency, low, high, color=style.AFTER, alpha=0.22, linewidth=0, label="95 % band"

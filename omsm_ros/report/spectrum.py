@@ -39,58 +39,47 @@ COLOURS = {
 _WIDTH_IN, _ROW_IN = 9.2, 2.5
 
 
-def over_time(scans: Sequence[tuple[StudiedScan, Sequence[NamedLine]]]) -> Figure:
-    """Draw the amplitude spectral density of each scan over time, with its lines."""
-    made, axes = style.figure(_WIDTH_IN, _ROW_IN * len(scans) + 0.3, len(scans), 1, sharex=True)
-    for row, (studied, named) in zip(axes[:, 0], scans, strict=True):
-        signal = studied.signal
-        _curve(row, studied.density(TIME), 1.0)
-        _marks(row, named, TIME, 1.0, signal.duration)
-        style.label(row, y="nm/√Hz", title=f"{style.named(signal.name)}, over time")
-    _kinds(axes[0, 0], [row for _, named in scans for row in named])
-    style.label(axes[-1, 0], x="frequency [Hz]")
-    return made
+def densities(
+    scans: Sequence[tuple[StudiedScan, Sequence[NamedLine]]], coordinate: str
+) -> Figure | None:
+    """Draw the amplitude spectral density of each scan over TIME or PATH, with its lines.
 
-
-def over_path(scans: Sequence[tuple[StudiedScan, Sequence[NamedLine]]]) -> Figure | None:
-    """Draw the density along the path over wavelength; None if no scan moves over the part."""
-    moving = [(s, n) for s, n in scans if PATH in s.coordinates]
-    if not moving:
+    Along the path over the wavelength; None if no scan moves over the part.
+    """
+    over = coordinate == PATH
+    shown = [(s, n) for s, n in scans if not over or PATH in s.coordinates]
+    if not shown:
         return None
-    made, axes = style.figure(_WIDTH_IN, _ROW_IN * len(moving) + 0.3, len(moving), 1, sharex=True)
-    for row, (studied, named) in zip(axes[:, 0], moving, strict=True):
-        signal = studied.signal
-        found = studied.density(PATH)
-        step = 0.5 / float(found.frequency[-1])
-        _curve(row, found, MICROMETRE_M, over=True)
-        _marks(row, named, PATH, MICROMETRE_M, float(np.ptp(signal.path)))
-        row.axvline(2 * step / MICROMETRE_M, color=style.MUTED, linewidth=0.8, linestyle=":")
-        style.label(row, y="nm·√mm", title=f"{style.named(signal.name)}, along the path")
-    style.label(axes[-1, 0], x="wavelength [µm]; dotted: twice the sampling distance")
+    made, axes = style.figure(_WIDTH_IN, _ROW_IN * len(shown) + 0.3, len(shown), 1, sharex=True)
+    unit, what = ("nm·√mm", "along the path") if over else ("nm/√Hz", "over time")
+    for row, (studied, named) in zip(axes[:, 0], shown, strict=True):
+        signal, found = studied.signal, studied.density(coordinate)
+        frequency, level = smoothed(found)
+        style.logarithmic(row.xaxis)
+        style.logarithmic(row.yaxis)
+        height = np.sqrt(level / MILLIMETRE_M if over else level) / NANOMETRE_M
+        row.plot(_place(frequency, over), height, color=style.MUTED, linewidth=0.8)
+        extent = float(np.ptp(signal.path)) / MILLIMETRE_M if over else signal.duration
+        for one in named:
+            if coordinate in one.line.possible:
+                # The height of a line of amplitude a is a²/2 over one frequency resolution.
+                at = _place(one.line.possible[coordinate], over)
+                top = one.line.amplitude * np.sqrt(extent / 2) / NANOMETRE_M
+                row.plot([at], [top], "o", color=COLOURS[one.kind], markersize=5, zorder=5)
+        if over:
+            twice = _place(found.frequency[-1], over)
+            row.axvline(twice, color=style.MUTED, linewidth=0.8, linestyle=":")
+        style.label(row, y=unit, title=f"{style.named(signal.name)}, {what}")
+    if not over:
+        _kinds(axes[0, 0], [row for _, named in shown for row in named])
+    along = "wavelength [µm]; dotted: twice the sampling distance"
+    style.label(axes[-1, 0], x=along if over else "frequency [Hz]")
     return made
 
 
-def _curve(axes: Axes, spectrum: Density, unit: float, *, over: bool = False) -> None:
-    frequency, level = smoothed(spectrum)
-    place = 1 / frequency / unit if over else frequency
-    height = np.sqrt(level / MILLIMETRE_M if over else level) / NANOMETRE_M
-    style.logarithmic(axes.xaxis)
-    style.logarithmic(axes.yaxis)
-    axes.plot(place, height, color=style.MUTED, linewidth=0.8)
-
-
-def _marks(
-    axes: Axes, named: Sequence[NamedLine], coordinate: str, unit: float, extent: float
-) -> None:
-    """Mark the lines at the height a²/2 over one frequency resolution, for amplitude a."""
-    for row in named:
-        if coordinate not in row.line.possible:
-            continue
-        at = row.line.possible[coordinate]
-        scale = extent / MILLIMETRE_M if coordinate == PATH else extent
-        height = row.line.amplitude * np.sqrt(scale / 2) / NANOMETRE_M
-        place = 1 / at / unit if coordinate == PATH else at
-        axes.plot([place], [height], "o", color=COLOURS[row.kind], markersize=5, zorder=5)
+def _place(frequency: Any, over: bool) -> Any:
+    """Return a frequency in time [Hz], or the wavelength of one along the path [µm]."""
+    return 1 / frequency / MICROMETRE_M if over else frequency
 
 
 def _kinds(axes: Axes, named: Sequence[NamedLine]) -> None:
@@ -165,8 +154,8 @@ def drawn(
     pairs = [(studied, named) for studied, named, _ in scans]
     spectra = [(studied.signal.name, motion) for studied, _, motion in scans]
     made = {
-        "time": over_time(pairs),
-        "path": over_path(pairs),
+        "time": densities(pairs, TIME),
+        "path": densities(pairs, PATH),
         "evidence": evidence(pairs),
         "motion": motion(spectra, valid_up_to),
     }

@@ -2,8 +2,8 @@
 
 import io
 import warnings
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -139,6 +139,49 @@ def envelope(time: FloatArray, value: FloatArray, columns: int = 900) -> Envelop
     cuts = np.linspace(0, len(value), min(columns, len(value)), endpoint=False)
     starts = np.unique(cuts.astype(np.int64))
     return time[starts], np.minimum.reduceat(value, starts), np.maximum.reduceat(value, starts)
+
+
+def draw_envelope(
+    axes: Axes, time: FloatArray, value: FloatArray, colour: str, **look: Any
+) -> None:
+    """Draw the values that are finite as their :func:`envelope` over ``time``."""
+    known = np.isfinite(value)
+    at, low, high = envelope(time[known], value[known])
+    axes.fill_between(at, low, high, color=colour, **{"linewidth": 0.6, **look})
+    axes.margins(x=0.01)
+
+
+# Ratio of the ends of a logarithmic axis below which powers of ten alone are too few numbers.
+_NARROW = 30.0
+
+
+class Panel(NamedTuple):
+    """One panel of a figure: curves (x, y) by name; ``log``: logarithmic axes, "", "x" or "xy"."""
+
+    title: str
+    x: str
+    y: str
+    curves: Mapping[str, tuple[FloatArray, FloatArray]]
+    log: str = ""
+
+
+def panels(*shown: Panel) -> Figure:
+    """Draw panels one below the other."""
+    made, axes = figure(9.2, 2.5 * len(shown) + 0.3, len(shown), 1)
+    for ax, panel in zip(axes[:, 0], shown, strict=True):
+        for (name, (x, y)), colour in zip(
+            panel.curves.items(), (BEFORE, AFTER, TRUTH, MUTED), strict=False
+        ):
+            ax.plot(x, y, linewidth=0.8, color=colour, label=name)
+        for k, name in enumerate(panel.log):
+            values = np.concatenate([curve[k] for curve in panel.curves.values()])
+            narrow = np.max(values) < _NARROW * np.min(values)
+            axis = getattr(ax, f"{name}axis")
+            logarithmic(axis, every=(1.0, 2.0, 5.0) if narrow else (1.0,))
+        label(ax, x=panel.x, y=panel.y, title=panel.title)
+        if len(panel.curves) > 1:
+            legend_above(ax)
+    return made
 
 
 def named(name: str) -> str:

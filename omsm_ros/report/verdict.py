@@ -74,22 +74,18 @@ def verdict_on_measurement(summary: Mapping[str, Any]) -> PageVerdict:
     Samples without account make it invalid; a summary of an earlier version holds no verdict.
     """
     warnings = [*map(str, part(summary, "warnings") or ())]
-    if against := _accounting(summary):
+    against = []
+    for name, stream in (part(summary, "samples") or {}).items():
+        seen = stream["corrected"] + stream.get("pending", 0) + sum(stream["counted"].values())
+        if seen != stream["received"]:
+            lost = count(abs(stream["received"] - seen))
+            against.append(f"{name}: {lost} samples unaccounted for")
+    if against:
         return PageVerdict("bad", "Measurement not valid", tuple(against))
     verdict = part(summary, "verdict")
     if not verdict:
         return PageVerdict("unknown", "Not verified", ("correct the scan again", *warnings))
     return page_verdict(verdict, warnings)
-
-
-def _accounting(summary: Mapping[str, object]) -> list[str]:
-    found = []
-    streams: Mapping[str, Any] = part(summary, "samples") or {}
-    for name, stream in streams.items():
-        seen = stream["corrected"] + stream.get("pending", 0) + sum(stream["counted"].values())
-        if seen != stream["received"]:
-            found.append(f"{name}: {count(abs(stream['received'] - seen))} samples unaccounted for")
-    return found
 
 
 _CONFORMITY = {"holds": "tolerance held", "fails": "tolerance exceeded"}

@@ -36,12 +36,12 @@ def corrected(monkeypatch, tmp_path):
     """Let the correction write the bag's name; return the corrected bags in order."""
     met = []
 
-    def correct(task):
+    def correct(task, _):
         met.append(task.bag)
         place = tmp_path / "out" / task.folder
         place.mkdir(parents=True, exist_ok=True)
         (place / "summary.json").write_text(json.dumps({"bag": task.bag}))
-        return DONE, "", 7
+        return replace(task, state=DONE, recorded_ns=7)
 
     monkeypatch.setattr(campaign, "correct_one", correct)
     return met

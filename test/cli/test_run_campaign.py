@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from itertools import islice
 
 import pytest
@@ -71,9 +72,9 @@ def test_what_is_done_is_not_done_again(shop, finished, tmp_path, monkeypatch):
     shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True)
     started = []
 
-    def note(task):
+    def note(task, _):
         started.append(task.bag)
-        return REFUSED, "still torn", None
+        return replace(task, state=REFUSED, said="still torn")
 
     monkeypatch.setattr(campaign, "correct_one", note)
     run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS)
@@ -107,10 +108,10 @@ def test_a_bag_with_which_every_worker_died_costs_no_other(shop, tmp_path, monke
     class KilledWorker(Exception):
         pass
 
-    def corrected(task):
+    def corrected(task, _):
         if task.bag == "a.mcap":
             raise KilledWorker("Attempted to run task 'a' on 4 different workers")
-        return DONE, "", None
+        return replace(task, state=DONE)
 
     monkeypatch.setattr(campaign, "correct_one", corrected)
     entries = run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS, jobs=1)

@@ -4,20 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from written_disturbances import write_disturbances
 
 from benchmarks.disturbance_catalogue import CATALOGUE
 from benchmarks.twin_motions import step_test_of
 from omsm_ros.errors import FileError, OmsmError
-from omsm_ros.pipelines.demonstrate import (
-    Demonstration,
-    response_errors,
-    sample_rows,
-    true_response,
-)
-from omsm_ros.twin.cell import Recording
+from omsm_ros.pipelines.demonstrate import Demonstration, response_errors, sample_rows
 from omsm_ros.twin.disturbances import NOTHING
 
 
@@ -82,20 +75,9 @@ def test_the_folder_of_an_earlier_demonstration_is_cleared(tmp_path):
 def test_the_truth_holds_the_latency(true_calibration):
     """Compared with a latency of 0.34 ms, the plant's dynamics lead by ω · 0.34 ms."""
     step = step_test_of(Demonstration(Path()).scenario, CATALOGUE["latency"][2])
-    rows = response_errors(true_calibration, true_response(step))
+    rows = response_errors(true_calibration, step.truth.response)
     assert len(rows) > 1
     for row in rows:
         assert row["gain_error"] == pytest.approx(0.0, abs=1e-9)
         expected = 360 * row["frequency"] * 0.34e-3
         assert row["phase_error_deg"] == pytest.approx(expected, rel=1e-6)
-
-
-def test_a_recording_without_truth_has_no_true_response(step_test):
-    foreign = Recording(
-        axes=step_test.axes,
-        distance=step_test.distance,
-        probe_motion=np.zeros(1),
-        surface_height=np.zeros(1),
-    )
-    with pytest.raises(OmsmError, match="holds no true values"):
-        true_response(foreign)

@@ -262,12 +262,12 @@ def named(kind, amplitude, **possible):
 def test_white_noise_stands_at_its_density_over_time_and_along_the_path():
     """One-sided, σ²·2T: 2 nm at 1 kHz are 0.0894 nm/√Hz; at 10 µm a sample 0.283 nm·√mm."""
     one = studied()
-    (axes,) = spectrum_figures.over_time([(one, [])]).axes
+    (axes,) = spectrum_figures.densities([(one, [])], TIME).axes
     (curve,) = points_of(axes)
     inside = (curve.get_xdata() > 20) & (curve.get_xdata() < 480)
     level = np.sqrt(np.mean(curve.get_ydata()[inside] ** 2))
     assert level == pytest.approx(2 * np.sqrt(2e-3), rel=0.1)
-    (axes,) = spectrum_figures.over_path([(one, [])]).axes
+    (axes,) = spectrum_figures.densities([(one, [])], PATH).axes
     curve, limit = points_of(axes)
     assert limit.get_xdata()[0] == pytest.approx(20.0)
     inside = (curve.get_xdata() > 22) & (curve.get_xdata() < 500)
@@ -279,7 +279,7 @@ def test_white_noise_stands_at_its_density_over_time_and_along_the_path():
 def test_a_line_is_marked_where_and_as_high_as_it_stands():
     one = studied(tone=(100.0, 50e-9))
     lines = [named(VIBRATION, 50e-9, **{TIME: 100.0}), named(PART, 8e-9, **{PATH: 2e4})]
-    (axes,) = spectrum_figures.over_time([(one, lines)]).axes
+    (axes,) = spectrum_figures.densities([(one, lines)], TIME).axes
     curve, dot, *_ = points_of(axes)
     duration = len(one.signal) * 1e-3
     assert dot.get_xdata() == pytest.approx([100.0])
@@ -288,7 +288,7 @@ def test_a_line_is_marked_where_and_as_high_as_it_stands():
     assert to_hex(dot.get_color()).upper() == spectrum_figures.COLOURS[VIBRATION]
     peak = curve.get_xdata()[np.argmax(curve.get_ydata())]
     assert peak == pytest.approx(100.0, rel=0.05)
-    (axes,) = spectrum_figures.over_path([(one, lines)]).axes
+    (axes,) = spectrum_figures.densities([(one, lines)], PATH).axes
     _, dot, _ = points_of(axes)
     assert dot.get_xdata() == pytest.approx([50.0])
     assert dot.get_ydata() == pytest.approx([8 * np.sqrt(one.signal.path[-1] * 1e3 / 2)])
@@ -296,11 +296,11 @@ def test_a_line_is_marked_where_and_as_high_as_it_stands():
 
 
 def test_a_scan_that_stands_still_has_no_path():
-    assert spectrum_figures.over_path([(studied(speed=0.0), [])]) is None
+    assert spectrum_figures.densities([(studied(speed=0.0), [])], PATH) is None
     both = [(studied(speed=0.0), []), (studied("moves"), [])]
-    (axes,) = spectrum_figures.over_path(both).axes
+    (axes,) = spectrum_figures.densities(both, PATH).axes
     assert axes.get_title("left") == "moves, along the path"
-    assert len(spectrum_figures.over_time(both).axes) == 2
+    assert len(spectrum_figures.densities(both, TIME).axes) == 2
 
 
 def test_evidence_has_each_scan_on_its_row_and_each_line_at_its_frequency():

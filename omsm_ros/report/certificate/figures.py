@@ -25,7 +25,7 @@ from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.readable import quantity
 from omsm_ros.report import style
-from omsm_ros.report.response_figures import bode, step_response
+from omsm_ros.report.response_figures import bode, draw_band, step_response
 from omsm_ros.units import DEGREE_RAD, MILLISECOND_S, NANOMETRE_M
 
 _COHERENT = 0.5
@@ -131,15 +131,13 @@ def residual(fitted: FittedRecord, noise: float | None) -> Figure:
 
 
 def _draw_over_time(axes: Axes, fitted: FittedRecord, noise: float | None) -> None:
-    known = np.isfinite(fitted.residual)
-    at, low, high = style.envelope(fitted.time[known], fitted.residual[known] / NANOMETRE_M)
-    axes.fill_between(at, low, high, color=style.AFTER, linewidth=0.5)
+    level = fitted.residual / NANOMETRE_M
+    style.draw_envelope(axes, fitted.time, level, style.AFTER, linewidth=0.5)
     if noise is not None:
         for sign in (-1, 1):
             label = "±2 × stationary noise" if sign > 0 else None
             axes.axhline(2 * sign * noise / NANOMETRE_M, label=label, **_LIMIT)
         style.legend_above(axes)
-    axes.margins(x=0.01)
     style.label(axes, x="time [s]", y="residual [nm]", title="Residual")
 
 
@@ -203,7 +201,6 @@ def order(candidates: Sequence[CandidateFit], chosen: Structure | None) -> Figur
 
 _LINES = 400
 _LOWEST_SHARE = 1e-3
-_SPAN_OF_MODEL = _SPAN | {"alpha": 0.22, "label": "95 % band"}
 
 
 def response(model: SampledModel) -> Figure:
@@ -213,15 +210,13 @@ def response(model: SampledModel) -> Figure:
     made, axes = style.figure(7.4, 4.6, rows=2, sharex=True)
     upper, lower = axes[:, 0]
     gain, spread = np.abs(value), np.exp(COVERAGE_FACTOR * np.minimum(band.gain, 5.0))
-    upper.fill_between(frequency, gain / spread, gain * spread, **_SPAN_OF_MODEL)
-    upper.plot(frequency, gain, color=style.AFTER, linewidth=1.6, label="identified")
+    draw_band(upper, frequency, gain / spread, gain, gain * spread)
     style.logarithmic(upper.yaxis)
     # A band that is open somewhere must not flatten the curve.
     upper.set_ylim(0.3 * float(gain.min()), 3 * float(gain.max()))
     phase = np.unwrap(np.angle(value)) / DEGREE_RAD
     off = COVERAGE_FACTOR * np.minimum(band.phase, np.pi) / DEGREE_RAD
-    lower.fill_between(frequency, phase - off, phase + off, **_SPAN_OF_MODEL)
-    lower.plot(frequency, phase, color=style.AFTER, linewidth=1.6)
+    draw_band(lower, frequency, phase - off, phase, phase + off)
     low, high = model.valid[0]
     for axes_ in (upper, lower):
         style.logarithmic(axes_.xaxis, every=(1.0, 2.0, 5.0))
@@ -242,22 +237,15 @@ def record(model: SampledModel, inputs: FloatArray, output: FloatArray, run: Fre
     inputs = inputs.reshape(len(inputs), -1)
     time = model.sections.period * np.arange(len(inputs))
     for column in inputs.T:
-        _draw(given, time, column, style.MUTED, "input")
-    _draw(both, time, output, style.BEFORE, "measured")
-    _draw(both, time, run.output, style.AFTER, "free run")
-    _draw(left, time, run.residual, style.AFTER, "")
+        style.draw_envelope(given, time, column, style.MUTED, alpha=0.75)
+    style.draw_envelope(both, time, output, style.BEFORE, alpha=0.75, label="measured")
+    style.draw_envelope(both, time, run.output, style.AFTER, alpha=0.75, label="free run")
+    style.draw_envelope(left, time, run.residual, style.AFTER, alpha=0.75)
     style.legend_above(both)
     style.label(given, y="input", title="Input")
     style.label(both, y="output", title="Output")
     style.label(left, x="time [s]", y="residual", title="Output less free run")
     return made
-
-
-def _draw(axes: Axes, time: FloatArray, value: FloatArray, colour: str, label: str) -> None:
-    known = np.isfinite(value)
-    at, low, high = style.envelope(time[known], value[known])
-    axes.fill_between(at, low, high, color=colour, linewidth=0.6, alpha=0.75, label=label or None)
-    axes.margins(x=0.01)
 
 
 def correlation(run: FreeRun) -> Figure:

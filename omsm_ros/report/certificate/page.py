@@ -67,8 +67,13 @@ def _verdict_reasons(calibration: Calibration) -> list[str]:
             f"(χ² = {plain(certificate.residual.chi_square)})"
         )
     if np.any(calibration.covariance):
-        top = quantity(calibration.valid_up_to, "Hz")
-        found.append(f"up to {top} the 95 % band is within {_band_text(calibration)}")
+        at = np.geomspace(1e-3, 1.0, 200) * calibration.valid_up_to
+        band = response_band(calibration.dynamics, calibration.covariance, at)
+        gain, phase = (COVERAGE_FACTOR * float(np.max(part)) for part in (band.gain, band.phase))
+        found.append(
+            f"up to {quantity(calibration.valid_up_to, 'Hz')} the 95 % band is within "
+            f"±{percent(gain)} in gain and ±{plain(phase / DEGREE_RAD, 2)}° in phase"
+        )
     delay_bound = certificate.response.inter_sample_delay_bound_s
     if delay_bound is not None:
         found.append(
@@ -79,25 +84,14 @@ def _verdict_reasons(calibration: Calibration) -> list[str]:
     return found
 
 
-def _band_text(calibration: Calibration) -> str:
-    at = np.geomspace(1e-3, 1.0, 200) * calibration.valid_up_to
-    band = response_band(calibration.dynamics, calibration.covariance, at)
-    gain, phase = (COVERAGE_FACTOR * float(np.max(part)) for part in (band.gain, band.phase))
-    return f"±{percent(gain)} in gain and ±{plain(phase / DEGREE_RAD, 2)}° in phase"
-
-
 def headlines(calibration: Calibration) -> list[Headline]:
     """Return the numbers that a reader looks for first, those that are known."""
-    return [h for h in _all_headlines(calibration) if h.value != NOTHING]
-
-
-def _all_headlines(calibration: Calibration) -> list[Headline]:
     certificate, dynamics = calibration.certificate, calibration.dynamics
     residual, spread = certificate.residual, certificate.static_gain.uncertainty
     delay = measured(
         dynamics.low_frequency_delay, certificate.response.low_frequency_delay_uncertainty_s, "s"
     )
-    return [
+    found = [
         Headline("Low-frequency delay", delay, _k1(delay, "by which the probe lags slow motion")),
         Headline(
             "Latency in it",
@@ -120,6 +114,7 @@ def _all_headlines(calibration: Calibration) -> list[Headline]:
         ),
         Headline("Structure", tables.structure_text(tables.structure_of(calibration)), ""),
     ]
+    return [headline for headline in found if headline.value != NOTHING]
 
 
 def _k1(text: str, detail: str) -> str:

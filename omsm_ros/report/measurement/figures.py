@@ -139,20 +139,39 @@ def _draw_map(
     scale_bar.set_label(f"{quantity} [{unit}]", fontsize=style.TEXT_PT, color=style.INK)
 
 
-def profile(raw: Profile, corrected: Profile, *, title: str, position: str) -> Figure:
-    """Draw one profile before and after the correction, and below it that after in nm.
+def profile(
+    above: Mapping[str, Profile],
+    below: Profile,
+    *,
+    title: str,
+    position: str,
+    unit: str,
+    height: str = "deviation",
+    lower: tuple[str, str] = ("", style.AFTER),
+    band: Profile | None = None,
+) -> Figure:
+    """Draw two profiles by their names in ``unit``, and below them another in nm.
 
-    position: name of the horizontal axis, drawn in mm
+    position, height: names of the axes, the horizontal one in mm
+    lower: name and colour of the profile below;  band: its standard uncertainty, drawn as ±2u
     """
     made, axes = style.figure(6.1, 3.6, rows=2, sharex=True)
-    upper, lower = axes[:, 0]
-    unit = unit_for(float(np.max(np.abs(raw.value))))
-    _draw_profile(upper, raw, UNITS_M[unit], color=style.BEFORE, label="uncorrected")
-    _draw_profile(upper, corrected, UNITS_M[unit], color=style.AFTER, label="corrected")
-    _draw_profile(lower, corrected, NANOMETRE_M, color=style.AFTER, label="corrected")
-    style.legend_above(upper)
-    style.label(upper, y=f"deviation [{unit}]", title=title)
-    style.label(lower, x=f"{position} [mm]", y="deviation [nm]")
+    first, second = axes[:, 0]
+    for (name, cut), colour in zip(above.items(), (style.BEFORE, style.AFTER), strict=True):
+        _draw_profile(first, cut, UNITS_M[unit], color=colour, label=name)
+    name, colour = lower
+    _draw_profile(second, below, NANOMETRE_M, color=colour, label=name)
+    if band is not None:
+        bound = 2 * band.value / NANOMETRE_M
+        second.fill_between(
+            band.position / MILLIMETRE_M, -bound, bound, color=style.AFTER, alpha=0.18,
+            linewidth=0, label="±U of a point, k = 2",
+        )  # fmt: skip
+    style.legend_above(first)
+    if name:
+        style.legend_above(second)
+    style.label(first, y=f"{height} [{unit}]", title=title)
+    style.label(second, x=f"{position} [mm]", y=f"{name or height} [nm]")
     return made
 
 
@@ -175,7 +194,8 @@ def dynamic_error(
     made, axes = style.figure(6.1, 3.7 if shown else 2.2, rows=1 + shown, sharex=True)
     upper, lower = axes[0, 0], axes[-1, 0]
     unit = unit_for(float(np.max(np.abs(before))))
-    _draw_envelope(upper, time, before, UNITS_M[unit], style.BEFORE)
+    style.draw_envelope(upper, time, before / UNITS_M[unit], style.BEFORE)
+    upper.axhline(0.0, color=style.MUTED, linewidth=0.6)
     style.label(upper, y=f"before [{unit}]", title="Dynamic error over the scan")
     if uncertainty is not None:
         at, _, largest = style.envelope(time, uncertainty)
@@ -187,15 +207,6 @@ def dynamic_error(
         style.label(lower, y="after [nm]")
     style.label(lower, x="time [s]")
     return made
-
-
-def _draw_envelope(
-    axes: Axes, time: FloatArray, value: FloatArray, scale: float, colour: str
-) -> None:
-    at, low, high = style.envelope(time, value)
-    axes.fill_between(at, low / scale, high / scale, color=colour, linewidth=0.6)
-    axes.axhline(0.0, color=style.MUTED, linewidth=0.6)
-    axes.margins(x=0.01)
 
 
 # Width of a profile's band relative to the aperture, and number of its segments across it.
@@ -258,41 +269,57 @@ def _maps(cloud: CloudView, deviations: dict[str, FloatArray]) -> dict[str, byte
     }
 
 
-_LINES = {
-    "profile_x": (0.0, "Profile along x", "x"),
-    "profile_y": (np.pi / 2, "Profile along y", "y"),
-    "profile_diagonal": (np.pi / 4, "Profile at 45°", "distance along x = y"),
+_ANGLES = {"profile_x": 0.0, "profile_y": np.pi / 2, "profile_diagonal": np.pi / 4}
+# Title, and name of the horizontal axis.
+PROFILES = {
+    "profile_x": ("Profile along x", "x"),
+    "profile_y": ("Profile along y", "y"),
+    "profile_diagonal": ("Profile at 45°", "distance along x = y"),
+    "profile_radius": ("Mean over each ring", "radius"),
 }
 
 
 def _profiles(cloud: CloudView, deviations: dict[str, FloatArray]) -> dict[str, bytes]:
-    titles = {name: words for name, (_, *words) in _LINES.items()}
-    titles["profile_radius"] = ["Mean over each ring", "radius"]
-    cuts = profile_cuts(cloud, deviations)
-    return {
-        name: style.png(profile(cut["raw"], cut["corrected"], title=title, position=position))
-        for name, (title, position) in titles.items()
-        if len((cut := cuts[name])["raw"].position)
-    }
+    made = {}
+    for name, cut in profile_cuts(cloud, deviations).items():
+        if len(cut["raw"].position):
+            above = {"uncorrected": cut["raw"], "corrected": cut["corrected"]}
+            unit = unit_for(float(np.max(np.abs(cut["raw"].value))))
+            title, position = PROFILES[name]
+            drawn = profile(above, cut["corrected"], title=title, position=position, unit=unit)
+            made[name] = style.png(drawn)
+    return made
 
 
 def profile_cuts(
     cloud: CloudView, deviations: dict[str, FloatArray]
-) -> dict[str, dict[str, form.Profile]]:
+) -> dict[str, dict[str, Profile]]:
     """Return the profiles of each kind of deviation (n,) [m], by the names of the figures."""
-    x, y = cloud.x, cloud.y
-    size = 2 * float(np.hypot(x, y).max())
+    size = 2 * float(np.hypot(cloud.x, cloud.y).max())
     turns = abs(np.ptp(np.unwrap(np.arctan2(cloud.y, cloud.x)))) / (2 * np.pi)
     feed = float(np.ptp(np.hypot(cloud.x, cloud.y)) / turns) if turns >= 1 else 0.0
     # Segments of full turns average out the errors of other orders.
     spacing = feed * np.ceil(size / _SEGMENTS / feed) if feed else size / _SEGMENTS
-    band = {"half_width": size * _BAND_SHARE / 2, "spacing": spacing}
-    cuts = {
-        name: {k: form.line_profile(x, y, v, angle=angle, **band) for k, v in deviations.items()}
-        for name, (angle, *_) in _LINES.items()
+    return cuts(cloud.x, cloud.y, deviations, size * _BAND_SHARE / 2, spacing, spacing)
+
+
+def cuts(
+    x: FloatArray, y: FloatArray, values: Mapping[str, FloatArray],
+    half_width: float, spacing: float, rings: float,
+) -> dict[str, dict[str, Profile]]:  # fmt: skip
+    """Return profiles of ``values`` at x, y [m], each (n,), by the names of the figures.
+
+    half_width, spacing: of the band along a line, and of its segments [m];  rings: width [m]
+    """
+    found = {
+        name: {
+            k: form.line_profile(x, y, v, angle=angle, half_width=half_width, spacing=spacing)
+            for k, v in values.items()
+        }
+        for name, angle in _ANGLES.items()
     }
-    rings = {k: form.radial_profile(x, y, v, spacing=spacing) for k, v in deviations.items()}
-    return {**cuts, "profile_radius": rings}
+    radial = {k: form.radial_profile(x, y, v, spacing=rings) for k, v in values.items()}
+    return {**found, "profile_radius": radial}
 
 
 # Figures of a registered part, from the contents of ``form.json`` and ``curves.json``.

@@ -100,7 +100,9 @@ class TestProfile:
     CUT = Profile(1e-3 * np.arange(5.0), 1e-6 * np.arange(5.0), np.ones(5, np.int64))
 
     def test_above_in_micrometres_below_in_nanometres(self):
-        figure = figures.profile(self.CUT, self.CUT, title="Along x", position="x")
+        figure = figures.profile(
+            {"a": self.CUT, "b": self.CUT}, self.CUT, title="Along x", position="x", unit="µm"
+        )
         upper, lower = figure.get_axes()
         for axes, values in ((upper, np.arange(5.0)), (lower, 1e3 * np.arange(5.0))):
             line = axes.get_lines()[0]
@@ -111,7 +113,8 @@ class TestProfile:
     def test_a_gap_in_the_cloud_breaks_the_line(self):
         position = np.r_[np.arange(10.0), np.arange(20.0, 30.0)] * 1e-3
         cut = Profile(position, np.ones(20), np.ones(20, np.int64))
-        line = figures.profile(cut, cut, title="", position="x").get_axes()[0].get_lines()[0]
+        figure = figures.profile({"a": cut, "b": cut}, cut, title="", position="x", unit="µm")
+        line = figure.get_axes()[0].get_lines()[0]
         assert np.flatnonzero(np.isnan(line.get_ydata())).tolist() == [10]
 
 
