@@ -31,6 +31,10 @@ POSE = ("piston", "tip", "tilt")
 _RIM = 96
 # Draws: a standard deviation to 4 %.
 _DRAWS = 300
+# Two turns may both lie a quarter of the width of a ring off its middle.
+_OFF_MIDDLE = 0.3
+# Shares of a cell at which its two Gaussian nodes are.
+_GAUSS = (0.5 - 12**-0.5, 0.5 + 12**-0.5)
 # Terms that are reported, and those that are fitted in addition.
 REPORTED_DEGREE, _FITTED_DEGREE = 4, 8
 
@@ -120,8 +124,8 @@ def form_map(
     more = np.stack([np.zeros(len(made.height)), *(change for _, _, change in alike)], axis=1)
     covariance += more @ more.T
     pv, rms = made.pv_and_rms(solution, seed, np.concatenate([open_changes, more], axis=1))
-    kept = [k for k, t in enumerate(every) if 2 <= t.n <= REPORTED_DEGREE]
-    by_heights = by_height[kept]
+    terms, coefficients, term_covariance = _reported(solution, nominal, removed, doubts)
+    shown = by_height[[every.index(t) for t in terms]] @ more
     return FormMap(
         x=places.x,
         y=places.y,
@@ -131,9 +135,9 @@ def form_map(
         pv=pv,
         rms=rms,
         disc=solution.network.part.disc,
-        terms=tuple(every[k] for k in kept),
-        coefficients=by_heights @ made.height,
-        term_covariance=by_heights @ covariance @ by_heights.T,
+        terms=terms,
+        coefficients=coefficients,
+        term_covariance=term_covariance + shown @ shown.T,
         removed=tuple(removed),
         pose=made.pose,
         resembled=tuple((name, _rms(places, change[:, np.newaxis])) for name, _, change in alike),
@@ -316,7 +320,9 @@ class _Made:
         """Return what ``doubts`` leave open, one standard uncertainty each, (n, k + 1) [m]."""
         found = [np.zeros(len(self.height))]
         for doubt in doubts:
-            before, after = (_Made.of(s, nominal, removed) for s in (doubt.before, doubt.after))
+            before, after = (
+                _Made.of(s, nominal, removed, self.places) for s in (doubt.before, doubt.after)
+            )
             found.append(doubt.share * (after.height - before.height))
         return np.stack(found, axis=1)
 
@@ -382,6 +388,33 @@ def places_of(solution: Solution, within: BoolArray | None = None) -> Places:
     )
 
 
+def nodes_of(solution: Solution) -> Places:
+    """Return two Gaussian nodes in every cell that was scanned.
+
+    Over the centres of the blocks terms of high degree are not orthogonal to the reported ones. Of
+    a cell that was scanned in part, which lies at an end of a ring or has its blocks off the middle
+    of it, the centre of the blocks.
+    """
+    part, centres = solution.network.part, places_of(solution)
+    inside = centres.area > 0
+    known = np.full((2, part.cells), np.nan)
+    known[:, centres.cell[inside]] = centres.x[inside], centres.y[inside]
+
+    def between(scanned: BoolArray) -> BoolArray:
+        return np.roll(scanned, 1) & np.roll(scanned, -1)
+
+    scanned = np.isfinite(known[0])
+    scanned |= between(scanned)
+    cell = np.flatnonzero(scanned)
+    known = known[:, cell]
+    off = np.hypot(*part.disc.scaled(*known)) * part.rings - np.floor(np.sqrt(cell / 3)) - 0.5
+    partly = ~between(scanned)[cell] | (np.abs(off) > _OFF_MIDDLE)
+    x, y = np.concatenate(
+        [np.where(partly, known, part.place_in(cell, share)) for share in _GAUSS], axis=1
+    )
+    return Places(x, y, np.tile(cell, 2), np.full(len(x), 1 / len(x)))
+
+
 def _pose(
     places: Places, nominal: Surface | None, removed: Sequence[str]
 ) -> tuple[FloatArray, FloatArray]:
@@ -415,6 +448,24 @@ def _term_fit(solution: Solution, places: Places) -> tuple[tuple[ZernikeIndex, .
     values = zernike_values(u, v, every).T
     root = np.sqrt(places.area)[:, np.newaxis]
     return every, np.asarray(np.linalg.pinv(values * root, rcond=1e-6) * root.T)
+
+
+def _reported(
+    solution: Solution, nominal: Surface | None, removed: Sequence[str], doubts: Sequence[Doubt]
+) -> tuple[tuple[ZernikeIndex, ...], FloatArray, FloatArray]:
+    """Return the reported terms, their coefficients [m] and covariance [m²].
+
+    Over the middles of the cells terms of high degree are not orthogonal to them.
+    """
+    made = _Made.of(solution, nominal, removed, nodes_of(solution))
+    every, fit = _term_fit(solution, made.places)
+    kept = [k for k, t in enumerate(every) if 2 <= t.n <= REPORTED_DEGREE]
+    fit = fit[kept]
+    spread = solution.factor.forward((fit @ made.rows[:, solution.active]).T)
+    of_cells = (fit @ made.member) * np.sqrt(made.share)
+    changes = fit @ made.open_changes(doubts, nominal, removed)
+    covariance = spread.T @ spread + of_cells @ of_cells.T + changes @ changes.T
+    return tuple(every[k] for k in kept), fit @ made.height, covariance
 
 
 def _resembled(

@@ -97,6 +97,13 @@ class PartModel:
         sectors = 6 * ring + 3
         return np.asarray(3 * ring**2 + np.minimum((share * sectors).astype(np.int64), sectors - 1))
 
+    def place_in(self, cell: IntArray, share: float) -> tuple[FloatArray, FloatArray]:
+        """Return x, y [m] midway along each ``cell`` (n,), with ``share`` of it further in."""
+        ring = np.sqrt(cell / 3).astype(np.int64)
+        radius = self.disc.radius / self.rings * np.sqrt(ring**2 + share * (2 * ring + 1))
+        angle = 2 * np.pi * (cell - 3 * ring**2 + 0.5) / (6 * ring + 3)
+        return self.disc.x + radius * np.cos(angle), self.disc.y + radius * np.sin(angle)
+
 
 def part_model(blocks: Blocks, turns: float, highest: int = HIGHEST_DEGREE) -> PartModel:
     """Return the terms and cells that ``blocks`` resolve.

@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from plain_world import MIRROR, RADIUS_M, Machine
 
 from omsm_ros.core.adjustment import Source, adjust
-from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
+from omsm_ros.core.surface.zernike_terms import zernike_values
 
 SPINDLE = {2: 12e-9, 3: 9e-9, 4: 5e-9}
 STRAIGHTNESS_M, STRETCH = 2e-9, 2e-6
@@ -104,13 +104,18 @@ def true_form(machine, form):
     return height - pose @ np.linalg.lstsq(pose * root, height * root[:, 0], rcond=None)[0]
 
 
-def true_terms(form, height):
-    """Return the coefficients of the reported terms of ``height`` by plain least squares [m]."""
-    every = terms_up_to(8)
-    values = zernike_values(*form.disc.scaled(form.x, form.y), every).T
-    root = np.sqrt(form.area)[:, np.newaxis]
-    found = np.linalg.lstsq(values * root, height * root[:, 0], rcond=None)[0]
-    return found[[every.index(t) for t in form.terms]]
+def true_terms(machine, form):
+    """Return the coefficients of the reported terms of the true form over the whole disc [m].
+
+    By their orthogonality: Gaussian nodes in the square of the radius, and even angles.
+    """
+    node, weight = np.polynomial.legendre.leggauss(60)
+    turn = np.exp(2j * np.pi * np.arange(180) / 180)
+    u, v = (np.outer(np.sqrt((node + 1) / 2), part).ravel() for part in (turn.real, turn.imag))
+    disc, area = form.disc, np.repeat(weight / 2 / 180, 180)
+    height = machine.truth(disc.x + disc.radius * u, disc.y + disc.radius * v)
+    values = zernike_values(u, v, form.terms)
+    return (values * area) @ height / (values**2 @ area)
 
 
 def normalised(machine, found):
@@ -118,7 +123,7 @@ def normalised(machine, found):
     form = found.form
     truth = true_form(machine, form)
     lag = found.source("lag_change")
-    terms = (form.coefficients - true_terms(form, truth)) / np.sqrt(np.diag(form.term_covariance))
+    terms = (form.coefficients - true_terms(machine, form)) / np.sqrt(np.diag(form.term_covariance))
     pv = (form.pv.value - np.ptp(truth)) / form.pv.uncertainty
     rms = (form.rms.value - np.sqrt(form.area @ truth**2)) / form.rms.uncertainty
     error = np.sqrt(form.area @ (form.height - truth) ** 2)

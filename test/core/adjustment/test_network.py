@@ -12,12 +12,13 @@ from omsm_ros.core.adjustment.adjust import _network
 from omsm_ros.core.adjustment.blocks import SECTORS, block_begins, white_noise
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.families import families_of, ranges_of
-from omsm_ros.core.adjustment.figures import effects_on_form, places_of
+from omsm_ros.core.adjustment.figures import _term_fit, effects_on_form, nodes_of, places_of
 from omsm_ros.core.adjustment.network import Factor, solve
 from omsm_ros.core.adjustment.part_terms import part_model
 from omsm_ros.core.adjustment.refutation import POSITIVE, completed, start_scales
 from omsm_ros.core.adjustment.scan_data import view_of, zero_of
 from omsm_ros.core.adjustment.sources import Source
+from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
 
 
 @pytest.fixture(scope="module")
@@ -184,15 +185,50 @@ def test_cells_are_alike_in_area(small):
 
 def test_the_map_reaches_the_peaks_at_the_rim():
     """A wave of 7 a turn that grows towards the rim, of a spiral with fewer blocks than cells."""
-    share = np.arange(42 * SECTORS + 1) / SECTORS
-    place = RADIUS_M * (1 - share / 42) * np.exp(2j * np.pi * share)
-    blocks = SimpleNamespace(x=place.real, y=place.imag)
-    part = part_model(blocks, 42)
-    assert 6 * part.rings - 3 > SECTORS
-    places = places_of(SimpleNamespace(network=SimpleNamespace(blocks=blocks, part=part)))
+    solution = spiral_of(42)
+    assert 6 * solution.network.part.rings - 3 > SECTORS
+    places = places_of(solution)
     wave = ((places.x + 1j * places.y) / RADIUS_M) ** 7
     turned = np.exp(1j * np.arange(0, 2 * np.pi, 0.1))[:, np.newaxis]
     assert np.min(np.ptp((wave * turned).real, axis=1)) > 0.997 * 2
+
+
+def spiral_of(turns, seen=lambda place: np.full(len(place), True)):
+    """Return a solution that knows where the blocks of a spiral inwards are, and no more."""
+    share = np.arange(turns * SECTORS + 1) / SECTORS
+    place = RADIUS_M * (1 - share / turns) * np.exp(2j * np.pi * share)
+    place = place[seen(place)]
+    blocks = SimpleNamespace(x=place.real, y=place.imag)
+    return SimpleNamespace(network=SimpleNamespace(blocks=blocks, part=part_model(blocks, turns)))
+
+
+@pytest.mark.parametrize("turns", [42, 127])
+def test_terms_that_are_not_fitted_leave_the_reported_ones_alone(turns):
+    """Of terms of degree 9 to 14 less than a hundredth passes; over centres of blocks 9 %."""
+    solution = spiral_of(turns)
+    nodes = nodes_of(solution)
+    every, fit = _term_fit(solution, nodes)
+    reported = [k for k, t in enumerate(every) if 2 <= t.n <= 4]
+    further = [t for t in terms_up_to(14) if t.n > 8]
+    disc = solution.network.part.disc
+    passed = fit[reported] @ zernike_values(*disc.scaled(nodes.x, nodes.y), further).T
+    assert np.max(np.abs(passed)) < 0.01
+
+
+@pytest.mark.parametrize(
+    "within",
+    [
+        lambda place: place.real,
+        lambda place: np.abs(place) - 0.53 * RADIUS_M,
+        lambda place: 0.7 * RADIUS_M - np.hypot(0.7 * place.real, place.imag),
+    ],
+)
+def test_nodes_lie_where_the_part_was_scanned(within):
+    """Half a disc, a disc with a hole and an ellipse: within half a ring of them."""
+    solution = spiral_of(42, lambda place: within(place) > 0)
+    nodes, part = nodes_of(solution), solution.network.part
+    beyond = np.min(within(nodes.x + 1j * nodes.y))
+    assert beyond > -0.5 * part.disc.radius / part.rings
 
 
 @pytest.mark.parametrize("share", [0.5, 4.0])
