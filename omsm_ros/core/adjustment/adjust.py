@@ -25,7 +25,7 @@ from omsm_ros.core.adjustment.figures import (
     form_map,
     largest_contribution,
 )
-from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve, walk_squares
+from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve, walk_deviate
 from omsm_ros.core.adjustment.part_terms import part_model
 from omsm_ros.core.adjustment.planning import best_addition
 from omsm_ros.core.adjustment.refutation import (
@@ -247,16 +247,16 @@ def _play_of(solution: Solution, assumed: float) -> float:
     return half if another else assumed
 
 
-def _walk(solution: Solution, priors: Sequence[Source]) -> tuple[float, float, float | None]:
-    """Return the drift found after one second [m], its relative uncertainty, and the declared one.
+def _walk(solution: Solution, priors: Sequence[Source]) -> tuple[float, float]:
+    """Return the drift found after one second [m], and how far it is beyond the declared one.
 
     A declared drift that fades may move by its whole size within a second.
     """
-    stated = {p.name: p.uncertainty for p in priors}
-    walk = stated.get("drift_walk")
-    allowed = None if walk is None else float(np.hypot(walk, stated.get("drift", 0.0)))
-    _, determined = walk_squares(solution)
-    return float(np.sqrt(solution.scales.walk)), float((2 * max(determined, 1.0)) ** -0.5), allowed
+    stated, found = {p.name: p.uncertainty for p in priors}, float(np.sqrt(solution.scales.walk))
+    if "drift_walk" not in stated:
+        return found, 0.0
+    allowed = float(np.hypot(stated["drift_walk"], stated.get("drift", 0.0)))
+    return found, walk_deviate(solution, allowed)
 
 
 def _network(

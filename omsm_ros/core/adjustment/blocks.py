@@ -15,6 +15,7 @@ import numpy as np
 from omsm_ros.core.adjustment.scan_data import ScanView
 from omsm_ros.core.adjustment.sources import Family
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
+from omsm_ros.core.streams.statistics import white_noise
 
 # 0.8 mm of the rim of a part of 25 mm; the 12th harmonic of a turn loses 2.6 %.
 SECTORS = 96
@@ -23,8 +24,6 @@ SECTORS = 96
 _NODES = 6
 # Blocks whose columns are held at a time: 170 columns of their points are 14 MB.
 _CHUNK = 2048
-# Second differences of white noise have six times its variance.
-_SECOND_DIFFERENCE = 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,9 +157,3 @@ def _columns(
             made[first : first + len(here), place : place + family.size] = values.mean(axis=2).T
             place += family.size
     return made
-
-
-def white_noise(deviation: FloatArray) -> float:
-    """Return the standard deviation of white noise by second differences."""
-    second = np.diff(deviation, 2)
-    return float(np.sqrt(np.mean(second**2) / _SECOND_DIFFERENCE))

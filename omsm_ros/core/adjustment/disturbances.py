@@ -14,6 +14,7 @@ from omsm_ros.core.adjustment.network import Solution
 from omsm_ros.core.adjustment.scan_data import ScanView
 from omsm_ros.core.adjustment.sources import VIBRATION, Family
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.streams.statistics import spread_about_median
 
 # Over its neighbours a bin of white noise is beyond 30 once in 10 000 scans of 250 000 points.
 _LINE_OVER_NOISE, _MOST_LINES = 30.0, 3
@@ -23,8 +24,6 @@ _LASTING = 0.5
 _PART_HARMONICS, _SIDE_BAND = 30, 0.12
 # Neighbours of a line, whose median is the noise.
 _BINS = 400
-# Median absolute deviation to standard deviation of a normal distribution.
-_MAD = 1.4826
 # The largest of 1500 differences between turns of clean scans was below 5.
 _STEP_LIMIT = 7.0
 # Share of the deviation that the removed error explains where its sign is wrong, and how near to
@@ -151,15 +150,11 @@ def steps_of(solution: Solution, scan: int) -> list[Step]:
     return [step for step in found if step.deviate > _STEP_LIMIT]
 
 
-def _deviates(moves: FloatArray) -> FloatArray:
-    scale = _MAD * float(np.median(np.abs(moves - np.median(moves))))
-    return np.asarray(np.abs(moves) / max(scale, 1e-15))
-
-
 def _height_step(solution: Solution, scan: int) -> Step:
     net = solution.network
     here, width = net.knots[scan], net.steps[scan]
-    size = _deviates(np.diff(solution.values[here]))
+    moves = np.diff(solution.values[here])
+    size = np.abs(moves) / max(spread_about_median(moves), 1e-15)
     knot = int(np.argmax(size))
     mine = net.blocks.scan == scan
     since = net.blocks.since[mine]
@@ -194,7 +189,8 @@ def _angle_step(solution: Solution, scan: int) -> Step:
     angle = np.bincount(turn, centred * left, turns) / np.maximum(power, 1e-300)
     # Weighted as they are known: near the axis an angle moves no height.
     known = np.sqrt(np.minimum(power[1:], power[:-1]))
-    size = _deviates(np.diff(angle) * known)
+    moves = np.diff(angle) * known
+    size = np.abs(moves) / max(spread_about_median(moves), 1e-15)
     best = int(np.argmax(size))
     since = net.blocks.since[mine]
     # Within the turn where it happens part of it is seen on either side.

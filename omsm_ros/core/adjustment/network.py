@@ -9,7 +9,7 @@ The normal equations without y are the geometry alone: planning uses them too.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -419,13 +419,15 @@ def estimate_scales(solution: Solution) -> Scales:
     determined_cells = float(np.sum(1 - share[seen] / max(scales.cells, _LEAST_VARIANCE)))
     return replace(
         scales,
-        walk=_variance(*walk_squares(solution), scales.walk, least),
+        walk=_variance(*_walk_squares(solution), scales.walk, least),
         bands=bands,
         cells=_variance(float(np.sum(cells**2)), determined_cells, scales.cells, least),
         noise=_noise(solution, residual - cells[net.part.cell], determined_cells),
     )
 
 
+# Share of a move's variance that the scans determine; less is rounding.
+_LEAST_KNOWN = 1e-6
 # A step of a variance; what has vanished, as a share of the variance of a block, may come back.
 _LARGEST_STEP, _VANISHED = 30.0, 1e-5
 
@@ -435,18 +437,38 @@ def _variance(square: float, determined: float, before: float, least: float) -> 
     return float(max(np.clip(found, before / _LARGEST_STEP, before * _LARGEST_STEP), least))
 
 
-def walk_squares(solution: Solution) -> tuple[float, float]:
+def _walk_squares(solution: Solution) -> tuple[float, float]:
     """Return the sum of squares of the drift's moves [m²/s], and how many the data determine."""
-    net, square, determined = solution.network, 0.0, 0.0
-    before = solution.scales.walk
-    for here, step in zip(net.knots, net.steps, strict=True):
-        moves = np.diff(solution.values[here])
-        covariance = solution.covariance_of(here)
-        d = np.diag(covariance)
-        variance = d[1:] + d[:-1] - 2 * np.diag(covariance, 1)
-        square += float(np.sum(moves**2)) / step
-        determined += float(np.sum(1 - variance / (before * step)))
+    square, determined = 0.0, 0.0
+    for moves, covariance in _moves(solution):
+        square += float(np.sum(moves**2)) * solution.scales.walk
+        determined += float(np.sum(1 - np.diag(covariance)))
     return square, determined
+
+
+def _moves(solution: Solution) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield the moves of the drift of each scan from knot to knot, over their prior standard
+    deviation, with their covariance."""
+    for here, step in zip(solution.network.knots, solution.network.steps, strict=True):
+        moves, size = np.diff(solution.values[here]), solution.scales.walk * step
+        one = np.diff(solution.covariance_of(here), axis=0)
+        yield moves / np.sqrt(size), np.diff(one, axis=1) / size
+
+
+def walk_deviate(solution: Solution, declared: float) -> float:
+    """Return how far the walk lies beyond ``declared`` [m/√s], in standard deviations.
+
+    It is the root of twice the logarithm of the ratio of likelihoods: moves that the scans hardly
+    determine say little, and few moves scatter more above their variance than below it.
+    """
+    gain, ratio = 0.0, max(declared**2 / solution.scales.walk, _LEAST_KNOWN)
+    for moves, covariance in _moves(solution):
+        share, axes = np.linalg.eigh(covariance)
+        known = np.maximum(1 - share, _LEAST_KNOWN)
+        before = 1 + (ratio - 1) * known
+        moved = (axes.T @ moves) ** 2 / known
+        gain += float(np.sum(moved * (1 / before - 1) + np.log(before)))
+    return float(np.sign(1 - ratio) * np.sqrt(max(gain, 0.0)))
 
 
 def _noise(solution: Solution, residual: FloatArray, determined_cells: float) -> FloatArray:

@@ -151,6 +151,9 @@ def from_scans_alone(
     trusted = min(_highest_excited(found), 0.5 / sample_period)
     scope = [] if found.known[LATENCY] else [Finding(SCOPE.code, WARNING)]
     spread = float(np.sqrt(found.covariance[LAG, LAG]))
+    # Without a step test a significantly negative lag is an error.
+    negative = total < -_PRIOR_CONFLICT_SIGMAS * spread
+    early = [Finding("adjustment.negative_lag", REJECTS, {"lag": -total})] if negative else []
     certificate = Certificate(
         self_calibration=_entries(found),
         latency=_latency(found, dynamics.low_frequency_delay),
@@ -162,7 +165,7 @@ def from_scans_alone(
             low_frequency_delay_s=dynamics.low_frequency_delay,
             low_frequency_delay_uncertainty_s=spread,
         ),
-    ).judged([*scope, *_early_reason(total, spread), *_findings(found)])
+    ).judged([*scope, *early, *_findings(found)])
     return Calibration(
         dynamics=dynamics,
         static_gain=static_gain,
@@ -265,12 +268,6 @@ def _findings(found: SelfCalibration) -> Iterator[Finding]:
     )
     if latency < -_PRIOR_CONFLICT_SIGMAS * np.sqrt(spread):
         yield Finding("adjustment.negative_latency", REJECTS, {"latency": -latency})
-
-
-def _early_reason(lag: float, uncertainty: float) -> Iterator[Finding]:
-    """Yield the reason to reject scans without a step test for a significantly negative lag."""
-    if lag < -_PRIOR_CONFLICT_SIGMAS * uncertainty:
-        yield Finding("adjustment.negative_lag", REJECTS, {"lag": -lag})
 
 
 def _highest_excited(found: SelfCalibration) -> float:

@@ -17,6 +17,7 @@ from omsm_ros.core.adjustment.scan_data import ScanData, ScanView, view_of, zero
 from omsm_ros.core.kinematics.kinematics import Geometry, Surface
 from omsm_ros.core.registration.probe_alignment import Alignment
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.streams.statistics import white_noise
 from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
 from omsm_ros.errors import DataError
 
@@ -119,7 +120,7 @@ def evaluate_sources(
             FoundSource("drift_rate", "m/s", abs(float(values[rate])), float(spread[rate])),
             FoundSource("drift_walk", "m/√s", *walk),
         ]
-    noise = float(np.std(np.diff(view.deviation, 2)) / np.sqrt(6))
+    noise = white_noise(view.deviation)
     if kind == STILL:
         found.insert(0, FoundSource("probe_noise", "m", noise, noise / np.sqrt(2 * len(view))))
     return tuple(found), tuple(missing)

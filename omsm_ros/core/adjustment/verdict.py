@@ -83,22 +83,21 @@ def reasons_of(
     declared: Collection[str],
     agreement: Sequence[ScanAgreement],
     wrong_sign: Sequence[tuple[int, float]],
-    walk: tuple[float, float, float | None],
+    walk: tuple[float, float],
     accepted: Collection[str],
     least: float = 0.0,
 ) -> tuple[Reason, ...]:
     """Return what contradicts the scans or their declarations.
 
     declared: names of the declared sources;  wrong_sign: scan, and share that it follows
-    walk: of the drift after one second, found, its relative uncertainty, and declared [m]
+    walk: of the drift after one second [m], and its standard deviations beyond the declared one
     accepted: names of families whose found value somebody has accepted
     least: effect below which a cause has no name: the model of the form may have made it [m]
     """
     found = [Reason(WRONG_SIGN, (str(scan),), share, 0.0) for scan, share in wrong_sign]
     causes = [r for r in refutations if not r.minor and set(accepted).isdisjoint(_names(r))]
-    size, spread, stated = walk[0], walk[1], walk[2] or 0.0
-    beyond = (size - stated) / max(spread * stated, 1e-15)
-    walks = walk[2] is not None and beyond > _RARE_WALK
+    size, beyond = walk
+    walks = beyond > _RARE_WALK
     # To the centre time and slide are one, and a line whose phase wanders is none.
     of_walk: tuple[str, ...] = ("drift_walk", "straightness_x", VIBRATION)
     if not all(r.explains for r in causes):

@@ -23,6 +23,7 @@ from omsm_ros.core.estimation.output_error import Fit, Problem
 from omsm_ros.core.estimation.steps import Steps, extended
 from omsm_ros.core.lti.frequency_response import FrequencyResponse, frequency_response
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.streams.statistics import white_noise
 
 # As resid of the System Identification Toolbox takes.
 _LAGS = 25
@@ -73,7 +74,7 @@ def residual_tests(problem: Problem, fitted: Fit, steps: Steps) -> ResidualTests
         # Rounded readings of a stationary axis hardly change and do not show the noise. Where the
         # axis crosses a step from sample to sample, the rounding error covers the whole step.
         active = crossing
-        noise = max(noise, step / np.sqrt(12.0), _white_noise_deviation(on_grid[crossing]))
+        noise = max(noise, step / np.sqrt(12.0), white_noise(on_grid[crossing]))
     seen_moving = on_grid[active] if np.any(active) else fitted.residual
     lost = fitted.structure.size
     timing = scatter_in_time(problem, fitted.residual)
@@ -128,12 +129,7 @@ def _active(steps: Steps, period: float) -> BoolArray:
 def _noise(on_grid: FloatArray, used: BoolArray, rest: BoolArray) -> float:
     if np.sum(rest) >= _LEAST_STATIONARY_SAMPLES:
         return float(np.std(on_grid[rest]))
-    return _white_noise_deviation(on_grid[used])
-
-
-def _white_noise_deviation(values: FloatArray) -> float:
-    """Return the standard deviation of white noise: what neighbouring samples do not share."""
-    return float(np.sqrt(np.mean(np.diff(values, 2) ** 2) / 6.0))
+    return white_noise(on_grid[used])
 
 
 def whiteness(residual: FloatArray, lags: int = _LAGS) -> float:

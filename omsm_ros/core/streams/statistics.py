@@ -40,6 +40,11 @@ def spread_about_median(values: FloatArray) -> float:
     return SIGMA_OF_MAD * median(abs(values - median(values)))
 
 
+def white_noise(values: FloatArray) -> float:
+    """Return the standard deviation of white noise (n,): what neighbours do not share."""
+    return float(np.sqrt(np.mean(np.diff(values, 2) ** 2) / 6))
+
+
 def noise_of(deviation: FloatArray) -> float:
     """Return the standard deviation of the noise from point to point [m], robustly.
 

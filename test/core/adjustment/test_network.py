@@ -9,15 +9,16 @@ from coverage import PRIORS
 from plain_world import MIRROR, RADIUS_M, Machine
 
 from omsm_ros.core.adjustment.adjust import _network
-from omsm_ros.core.adjustment.blocks import SECTORS, block_begins, white_noise
+from omsm_ros.core.adjustment.blocks import SECTORS, block_begins
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.families import families_of, ranges_of
 from omsm_ros.core.adjustment.figures import _term_fit, effects_on_form, nodes_of, places_of
-from omsm_ros.core.adjustment.network import Factor, solve
+from omsm_ros.core.adjustment.network import Factor, solve, walk_deviate
 from omsm_ros.core.adjustment.part_terms import part_model
 from omsm_ros.core.adjustment.refutation import POSITIVE, completed, start_scales
 from omsm_ros.core.adjustment.scan_data import view_of, zero_of
 from omsm_ros.core.adjustment.sources import Source
+from omsm_ros.core.streams.statistics import white_noise
 from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
 
 
@@ -280,3 +281,33 @@ def test_a_linearity_is_declared_at_its_half_range(small):
 
 def linearity(end):
     return [Source(n, 3e-9, half_range=end) for n in ("probe_linearity", "probe_square")]
+
+
+def walk_of(seen, noise, step):
+    """Return a solution of moves that were ``seen`` (k,) with a variance of ``noise`` [m²]: their
+    best walk [m²/s], and what is left of them and unknown by it."""
+    walk = max(np.mean(seen**2) - noise, 1e-3 * noise) / step
+    share = walk * step / (walk * step + noise)
+    knots = np.arange(len(seen) + 1)
+    return SimpleNamespace(
+        scales=SimpleNamespace(walk=walk),
+        network=SimpleNamespace(knots=[slice(0, len(knots))], steps=[step]),
+        values=np.append(0.0, np.cumsum(share * seen)),
+        covariance_of=lambda here: share * noise * np.minimum.outer(knots, knots),
+    )
+
+
+def test_a_declared_walk_is_refuted_as_rarely_as_stated():
+    """Fifty moves of which the scans determine half: deviates of the declared walk are normal."""
+    random, declared, step = np.random.default_rng(4), 1.2e-9, 0.5
+    noise = declared**2 * step
+    found = [
+        walk_deviate(
+            walk_of(np.sqrt(2 * noise) * random.standard_normal(50), noise, step), declared
+        )
+        for _ in range(600)
+    ]
+    assert abs(np.mean(found)) < 0.2
+    assert np.std(found) == pytest.approx(1.0, abs=0.1)
+    larger = walk_of(np.sqrt(5 * noise) * random.standard_normal(50), noise, step)
+    assert walk_deviate(larger, declared) > 3.0
