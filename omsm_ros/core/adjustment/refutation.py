@@ -39,6 +39,8 @@ _MOST_RELEASED = 8
 _MOST_TRIED = 3
 # Before the scans: of ten errors that nobody declared, a machine has one.
 ODDS_ABSENT, SURE = 9.0, 50.0
+# No model is surer; with a smaller prior, what the scans know of a family would be rounding.
+_LEAST_PROBABLE = 1e-6
 # Starting values; each step moves a variance by 30 at most, and four are enough for 2 %.
 _WALK_START, _BAND_START_M, _CELLS_START_M = 1e-18, 3e-9, 3e-9
 _FIRST_STEPS, _FURTHER_STEPS = 5, 3
@@ -266,7 +268,8 @@ def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Sol
     sizes: dict[str, float | FloatArray] = dict(solution.sizes)
     for family in solution.network.families:
         one, declared = evidence_of(solution, family), solution.sizes.get(family.name)
-        root = np.sqrt(1 / (1 + ODDS_ABSENT * np.exp(-min(one.gain, SURE) / 2)))
+        probable = 1 / (1 + ODDS_ABSENT * np.exp(-min(one.gain, SURE) / 2))
+        root = np.sqrt(max(probable, _LEAST_PROBABLE))
         if family.named and declared is None:
             size = root * np.hypot(one.values, one.uncertainty)
             sizes[family.name] = np.minimum(size, family.wide)
