@@ -31,9 +31,9 @@ class Drawn:
         world = World(seed=_SCANNED)
         found = adjusted(world, QUICK)
         self.solution, self.radius, self.nominal = found.solution, world.radius, world.nominal
-        self.made = figures._Made.of(self.solution, PAPER_MIRROR, REMOVED)
-        self.effects = figures.effects_on_form(self.solution, PAPER_MIRROR, REMOVED)
-        form = figures.form_map(self.solution, PAPER_MIRROR, REMOVED)
+        self.made = figures.FormOf.of(self.solution, PAPER_MIRROR, REMOVED)
+        self.effects = figures.effects_on_form(self.made)
+        form = figures.form_map(self.made)
         self.covariance, self.term_covariance = form.covariance, form.term_covariance
         self.every, self.by_height = figures._term_fit(self.solution, self.made.places)
         self.kept = [self.every.index(t) for t in form.terms]
@@ -68,12 +68,9 @@ class Drawn:
         true = self.made.free(Figure.draw(seed, self.radius).height(places.x, places.y))
         chance = np.random.default_rng([seed, 7]).standard_normal(len(true))
         seen = replace(self.made, height=true + self.made.free(error) + self.root @ chance)
-        alike = figures._resembled(
-            seen, self.covariance, self.every, self.by_height, self.effects,
-            self.solution.network.families,
-        )  # fmt: skip
+        alike = figures._resembled(seen, self.covariance, self.every, self.by_height, self.effects)
         more = np.stack([np.zeros(len(true)), *(change for *_, change in alike)], axis=1)
-        pv, rms = seen.pv_and_rms(self.solution, 0, more)
+        pv, rms = seen.pv_and_rms(more)
         to_terms = self.by_height[self.kept]
         spread = np.diag(self.term_covariance) + np.sum((to_terms @ more) ** 2, axis=1)
         off = [pv.value - np.ptp(true), rms.value - np.sqrt(area @ true**2)]

@@ -21,6 +21,7 @@ from omsm_ros.core.adjustment.figures import (
     POSE,
     Effect,
     FormMap,
+    FormOf,
     effects_on_form,
     form_map,
     largest_contribution,
@@ -194,16 +195,16 @@ def adjust(
     zero = zero_of(scans, surface)
     views = [view_of(s, k, zero, surface) for k, s in enumerate(scans)]
     detecting, refutations, doubts = _with_its_play(scans, views, priors)
-    solution = completed(detecting, refutations)
-    families = solution.network.families
-    effects = effects_on_form(solution, surface, removed)
-    form = form_map(solution, surface, removed, doubts, effects)
+    solution, families = completed(detecting, refutations), detecting.network.families
+    made = FormOf.of(solution, surface, removed)
+    effects = effects_on_form(made)
+    form = form_map(made, doubts, effects)
     # The zero of the heights was taken off before the fit, and belongs to the piston.
     form = replace(form, pose=form.pose + zero.height * (np.array(removed) == "piston"))
     agreement = agreement_of(solution, surface, removed)
     wrong = _wrong_signs(views)
-    walk, enough = _walk(detecting, priors), redundant(scans)
-    stated, least = {p.name for p in priors}, MODEL_SHARE * form.rms.value
+    enough, stated = redundant(scans), {p.name for p in priors}
+    walk, least = _walk(detecting, priors), MODEL_SHARE * form.rms.value
     reasons = reasons_of(refutations, stated, agreement, wrong, walk, accepted, least)
     verdict = verdict_of(
         _or_sense_of_c(reasons, scans, priors, surface, refutations),
@@ -213,7 +214,7 @@ def adjust(
         enough, 2 * form.pv.uncertainty, accuracy,
         None if enough else best_addition(scans[0], priors, surface, removed),
         calibration,
-        largest_contribution(solution, effects, surface, removed, doubts, accuracy),
+        largest_contribution(made, effects, doubts, accuracy),
     )  # fmt: skip
     return Adjustment(
         form=form,

@@ -13,7 +13,7 @@ import numpy as np
 
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.families import DIFFERS
-from omsm_ros.core.adjustment.figures import Figure, places_of, pv_and_rms
+from omsm_ros.core.adjustment.figures import Figure, FormOf, places_of
 from omsm_ros.core.adjustment.network import Solution, solve
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
@@ -64,7 +64,7 @@ def agreement_of(
     for k in range(blocks.scans):
         scales = replace(solution.scales, noise=solution.scales.noise[[k]])
         one = solve(solution.network.alone(k), y[blocks.scan == k], scales, {})
-        alone.append(pv_and_rms(one, nominal, removed, places))
+        alone.append(FormOf.of(one, nominal, removed, places).pv_and_rms())
     return tuple(_compared(solution, k, alone) for k in range(blocks.scans))
 
 

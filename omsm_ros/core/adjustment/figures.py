@@ -97,34 +97,26 @@ class Places:
 
 
 def form_map(
-    solution: Solution,
-    nominal: Surface | None,
-    removed: Sequence[str] = POSE,
-    doubts: Sequence[Doubt] = (),
-    effects: Mapping[str, Effect] | None = None,
-    seed: int = 0,
+    made: FormOf, doubts: Sequence[Doubt] = (), effects: Mapping[str, Effect] | None = None
 ) -> FormMap:
-    """Return the form error that ``solution`` found.
+    """Return the form error ``made``.
 
-    nominal: for the slopes of ``x``, ``y`` and ``clocking``;  removed: names of the pose
     doubts: what they change is uncertain;  effects: of families, which the form may look like
-    seed: of the draws
     """
-    made = _Made.of(solution, nominal, removed)
-    places, rows = made.places, made.rows[:, solution.active]
-    open_changes = made.open_changes(doubts, nominal, removed)
-    spread = solution.factor.forward(rows.T)
+    solution, places = made.solution, made.places
+    open_changes = made.open_changes(doubts)
+    spread = solution.factor.forward(made.rows[:, solution.active].T)
     raw = spread.T @ spread
     of_cells = made.member @ scipy.sparse.diags_array(made.share) @ made.member.T
     raw += of_cells.toarray()
     covariance = made.free(made.free(raw).T)
     covariance += open_changes @ open_changes.T
     every, by_height = _term_fit(solution, places)
-    alike = _resembled(made, covariance, every, by_height, effects or {}, solution.network.families)
+    alike = _resembled(made, covariance, every, by_height, effects or {})
     more = np.stack([np.zeros(len(made.height)), *(change for _, _, change in alike)], axis=1)
     covariance += more @ more.T
-    pv, rms = made.pv_and_rms(solution, seed, np.concatenate([open_changes, more], axis=1))
-    terms, coefficients, term_covariance = _reported(solution, nominal, removed, doubts)
+    pv, rms = made.pv_and_rms(np.concatenate([open_changes, more], axis=1))
+    terms, coefficients, term_covariance = _reported(made, doubts)
     shown = by_height[[every.index(t) for t in terms]] @ more
     return FormMap(
         x=places.x,
@@ -138,20 +130,10 @@ def form_map(
         terms=terms,
         coefficients=coefficients,
         term_covariance=term_covariance + shown @ shown.T,
-        removed=tuple(removed),
+        removed=made.removed,
         pose=made.pose,
         resembled=tuple((name, _rms(places, change[:, np.newaxis])) for name, _, change in alike),
     )
-
-
-def pv_and_rms(
-    solution: Solution,
-    nominal: Surface | None,
-    removed: Sequence[str] = POSE,
-    places: Places | None = None,
-) -> tuple[Figure, Figure]:
-    """Return PV and rms of the form that ``solution`` found at ``places``; None: as `form_map`."""
-    return _Made.of(solution, nominal, removed, places).pv_and_rms(solution, 0)
 
 
 class Effect(NamedTuple):
@@ -173,11 +155,9 @@ class Effect(NamedTuple):
 NO_EFFECT = Effect(0.0, 0.0, np.zeros((0, 0)), np.zeros((0, 0)))
 
 
-def effects_on_form(
-    solution: Solution, nominal: Surface | None, removed: Sequence[str] = POSE
-) -> dict[str, Effect]:
+def effects_on_form(made: FormOf) -> dict[str, Effect]:
     """Return by family what it may do to the form; all others are fitted together with it."""
-    made = _Made.of(solution, nominal, removed)
+    solution = made.solution
     # L P, with P the covariance of the parameters that take part.
     through = made.free(made.rows[:, solution.active] @ solution.covariance)
     # Which forms are probable counts once only, where the form is compared with each family.
@@ -217,22 +197,22 @@ class Contribution:
 
 
 def largest_contribution(
-    solution: Solution, effects: Mapping[str, Effect], nominal: Surface,
-    removed: Sequence[str], doubts: Sequence[Doubt], accuracy: float | None,
-) -> Contribution | None:  # fmt: skip
+    made: FormOf, effects: Mapping[str, Effect], doubts: Sequence[Doubt], accuracy: float | None
+) -> Contribution | None:
     """Return the source with the largest effect on the form, and the size that ``accuracy`` allows.
 
     effects: of :func:`effects_on_form`;  doubts: as for :func:`form_map`
     accuracy: expanded uncertainty of PV asked for [m]; None, or more than there is: None
     """
+    solution = made.solution
     known = [f for f in solution.network.families
              if f.named and f.name in effects and base_name(f.name) not in FREE]  # fmt: skip
     if accuracy is None or not known:
         return None
     family = max(known, key=lambda f: effects[f.name].left)
-    made, part = _Made.of(solution, nominal, removed), _part(solution, family)
-    errors, parameters = made.errors(solution, 0)
-    errors = made.with_changes(made.free(errors), made.open_changes(doubts, nominal, removed), 0)
+    part = _part(solution, family)
+    errors, parameters = made.errors()
+    errors = made.with_changes(made.free(errors), made.open_changes(doubts))
     covariance = solution.covariance[part, part]
     through = made.free(made.rows[:, solution.active] @ solution.covariance[:, part])
     own = through @ np.linalg.pinv(covariance, rcond=1e-10) @ parameters[part]
@@ -260,13 +240,18 @@ def _part(solution: Solution, family: Family) -> slice:
 
 
 @dataclass(frozen=True, eq=False)
-class _Made:
-    """The map, and what it depends on.
+class FormOf:
+    """The form error that ``solution`` found, without its pose, and what it depends on.
 
+    nominal: for the slopes of ``x``, ``y`` and ``clocking``;  removed: names of the pose
+    height: at ``places`` (n,) [m];  pose: values of what was removed
     rows: change of the map by all parameters (n, p);  share: variance of cells
     member: cell of each place (n, cells);  columns, fit: of the pose (n, k), (k, n)
     """
 
+    solution: Solution
+    nominal: Surface | None
+    removed: tuple[str, ...]
     places: Places
     height: FloatArray
     pose: FloatArray
@@ -278,10 +263,10 @@ class _Made:
 
     @classmethod
     def of(
-        cls, solution: Solution, nominal: Surface | None, removed: Sequence[str],
+        cls, solution: Solution, nominal: Surface | None, removed: Sequence[str] = POSE,
         places: Places | None = None,
-    ) -> _Made:  # fmt: skip
-        """Return the map of ``solution`` at ``places``; None: at all that were scanned."""
+    ) -> FormOf:  # fmt: skip
+        """Return the form by ``solution`` at ``places``; None: at all that were scanned."""
         net, scales = solution.network, solution.scales
         places = places or places_of(solution)
         share = net.cell_share(net.weights(scales), scales)
@@ -297,47 +282,45 @@ class _Made:
             (np.ones(number), (np.arange(number), places.cell)), shape=(number, len(share))
         )
         return cls(
-            places, height - columns @ (fit @ height), fit @ height,
-            rows, share, member, columns, fit,
+            solution, nominal, tuple(removed), places, height - columns @ (fit @ height),
+            fit @ height, rows, share, member, columns, fit,
         )  # fmt: skip
 
-    def pv_and_rms(
-        self, solution: Solution, seed: int, open_changes: FloatArray | None = None
-    ) -> tuple[Figure, Figure]:
+    def at(self, places: Places, solution: Solution | None = None) -> FormOf:
+        """Return the form at other ``places``, or as another ``solution`` found it."""
+        return FormOf.of(solution or self.solution, self.nominal, self.removed, places)
+
+    def pv_and_rms(self, open_changes: FloatArray | None = None) -> tuple[Figure, Figure]:
         """Return PV and rms with their uncertainty by draws.
 
         open_changes: further changes of the map (n, k), each as likely as a normal deviate [m]
         """
-        draws = self.free(self.errors(solution, seed)[0])
+        draws = self.free(self.errors()[0])
         if open_changes is not None:
-            draws = self.with_changes(draws, open_changes, seed)
+            draws = self.with_changes(draws, open_changes)
         rms = _figure(self.height, draws, lambda h: np.sqrt(self.places.area @ h**2))
         return _figure(self.height, draws, _pv), rms
 
-    def open_changes(
-        self, doubts: Sequence[Doubt], nominal: Surface | None, removed: Sequence[str]
-    ) -> FloatArray:
+    def open_changes(self, doubts: Sequence[Doubt]) -> FloatArray:
         """Return what ``doubts`` leave open, one standard uncertainty each, (n, k + 1) [m]."""
         found = [np.zeros(len(self.height))]
         for doubt in doubts:
-            before, after = (
-                _Made.of(s, nominal, removed, self.places) for s in (doubt.before, doubt.after)
-            )
+            before, after = (self.at(self.places, s) for s in (doubt.before, doubt.after))
             found.append(doubt.share * (after.height - before.height))
         return np.stack(found, axis=1)
 
-    def with_changes(self, draws: FloatArray, changes: FloatArray, seed: int) -> FloatArray:
+    def with_changes(self, draws: FloatArray, changes: FloatArray) -> FloatArray:
         """Return ``draws`` (n, draws) with ``changes`` (n, k), each a normal deviate of its own."""
-        chance = np.random.default_rng([seed, 1])
+        chance = np.random.default_rng([0, 1])
         return draws + changes @ chance.standard_normal((changes.shape[1], _DRAWS))
 
     def free(self, heights: FloatArray) -> FloatArray:
         """Return ``heights`` (n, …) without their pose."""
         return np.asarray(heights - self.columns @ (self.fit @ heights))
 
-    def errors(self, solution: Solution, seed: int) -> tuple[FloatArray, FloatArray]:
+    def errors(self) -> tuple[FloatArray, FloatArray]:
         """Return errors of the map as they may be, (n, draws) [m], and of the parameters."""
-        random = np.random.default_rng(seed)
+        random, solution = np.random.default_rng(0), self.solution
         factor = solution.factor
         normal = random.standard_normal((len(solution.active), _DRAWS))
         moved = scipy.linalg.solve_triangular(factor.root, normal, lower=True, trans="T")
@@ -451,26 +434,24 @@ def _term_fit(solution: Solution, places: Places) -> tuple[tuple[ZernikeIndex, .
 
 
 def _reported(
-    solution: Solution, nominal: Surface | None, removed: Sequence[str], doubts: Sequence[Doubt]
+    form: FormOf, doubts: Sequence[Doubt]
 ) -> tuple[tuple[ZernikeIndex, ...], FloatArray, FloatArray]:
-    """Return the reported terms, their coefficients [m] and covariance [m²].
-
-    Over the middles of the cells terms of high degree are not orthogonal to them.
-    """
-    made = _Made.of(solution, nominal, removed, nodes_of(solution))
+    """Return the reported terms, their coefficients [m] and covariance [m²]."""
+    solution = form.solution
+    made = form.at(nodes_of(solution))
     every, fit = _term_fit(solution, made.places)
     kept = [k for k, t in enumerate(every) if 2 <= t.n <= REPORTED_DEGREE]
     fit = fit[kept]
     spread = solution.factor.forward((fit @ made.rows[:, solution.active]).T)
     of_cells = (fit @ made.member) * np.sqrt(made.share)
-    changes = fit @ made.open_changes(doubts, nominal, removed)
+    changes = fit @ made.open_changes(doubts)
     covariance = spread.T @ spread + of_cells @ of_cells.T + changes @ changes.T
     return tuple(every[k] for k in kept), fit @ made.height, covariance
 
 
 def _resembled(
-    made: _Made, covariance: FloatArray, terms: Sequence[ZernikeIndex], by_height: FloatArray,
-    effects: Mapping[str, Effect], families: Sequence[Family],
+    made: FormOf, covariance: FloatArray, terms: Sequence[ZernikeIndex], by_height: FloatArray,
+    effects: Mapping[str, Effect],
 ) -> list[tuple[str, float, FloatArray]]:  # fmt: skip
     """Return families that the scans leave open and that the form speaks for, likeliest first.
 
@@ -486,7 +467,7 @@ def _resembled(
     form = FormTerms(fit @ made.height, fit @ covariance @ fit.T, degrees, symmetric)
     least = float(np.sqrt(made.places.area @ np.diag(covariance)))
     found = []
-    for family in families:
+    for family in made.solution.network.families:
         effect = effects.get(family.name, NO_EFFECT)
         if effect.free < least or not family.named or base_name(family.name) in FREE:
             continue

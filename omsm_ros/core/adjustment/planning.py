@@ -19,7 +19,7 @@ from omsm_ros.core.adjustment.families import (
     families_of,
     ranges_of,
 )
-from omsm_ros.core.adjustment.figures import POSE, form_map
+from omsm_ros.core.adjustment.figures import POSE, FormOf, form_map
 from omsm_ros.core.adjustment.network import Network, Scales, solve
 from omsm_ros.core.adjustment.part_terms import part_model
 from omsm_ros.core.adjustment.refutation import completed
@@ -131,7 +131,7 @@ def posterior_uncertainty(
     network = Network(blocks, families, part)
     solution = solve(network, np.zeros(len(blocks)), scales, sizes)
     return PlannedUncertainty(
-        form=form_map(completed(solution), nominal, removed).mean_uncertainty,
+        form=form_map(FormOf.of(completed(solution), nominal, removed)).mean_uncertainty,
         sources={f.name: solution.uncertainty(f.name) for f in families if f.name in sizes},
         duration=begin - _PAUSE_S,
     )

@@ -39,7 +39,7 @@ _MOST_RELEASED = 8
 _MOST_TRIED = 3
 # Before the scans: of ten errors that nobody declared, a machine has one.
 ODDS_ABSENT, SURE = 9.0, 50.0
-# No model is surer; with a smaller prior, what the scans know of a family would be rounding.
+# No model excludes more; with a smaller prior, what the scans know of a family would be rounding.
 _LEAST_PROBABLE = 1e-6
 # Starting values; each step moves a variance by 30 at most, and four are enough for 2 %.
 _WALK_START, _BAND_START_M, _CELLS_START_M = 1e-18, 3e-9, 3e-9

@@ -12,7 +12,7 @@ from omsm_ros.core.adjustment.adjust import _network
 from omsm_ros.core.adjustment.blocks import SECTORS, block_begins
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.families import families_of, ranges_of
-from omsm_ros.core.adjustment.figures import _term_fit, effects_on_form, nodes_of, places_of
+from omsm_ros.core.adjustment.figures import FormOf, _term_fit, effects_on_form, nodes_of, places_of
 from omsm_ros.core.adjustment.network import Factor, solve, walk_deviate
 from omsm_ros.core.adjustment.part_terms import part_model
 from omsm_ros.core.adjustment.refutation import POSITIVE, completed, start_scales
@@ -159,7 +159,7 @@ def test_a_smooth_part_does_not_tell_the_size_of_a_source(small):
     rough, smooth = (solve(network, y, replace(scales, bands=b), sizes) for b in bands)
     left = [np.linalg.norm(evidence_of(s, family).free) for s in (rough, smooth)]
     assert left[1] < 0.6 * left[0]
-    known = [effects_on_form(s, MIRROR)[family.name].known for s in (rough, smooth)]
+    known = [effects_on_form(FormOf.of(s, MIRROR))[family.name].known for s in (rough, smooth)]
     np.testing.assert_allclose(*known, rtol=1e-6, atol=1e-6)
 
 
