@@ -282,6 +282,42 @@ class MissedTriggerDetector:
         return found
 
 
+# Square of the mean resultant length of phases above which arrivals are locked to the trigger: some
+# phases are then 1.6 times as frequent as others, or more.
+_LOCKED = 0.1
+# Arrivals later than the earliest of their span by more were delayed [period].
+_EARLY_PERIODS = 2.0
+
+
+class _Phases:
+    """Phases of arrivals within the period of the trigger, and whether they are locked to it.
+
+    A host that polls at its own times sees each age of the last sample equally often. If its polls
+    keep step with the trigger, the age stays, or grows slowly until it falls by a whole period.
+    That looks like a missed trigger.
+    """
+
+    def __init__(self) -> None:
+        self._begin, self._lates = -math.inf, list[float]()  # of the current span
+        self._means: deque[complex] = deque(maxlen=_LATEST)
+        self.locked = False  # whether the phases of successive spans agree
+
+    def add(self, late: float, arrival: float) -> None:
+        """Enter an arrival;  late: [period];  arrival: [s]."""
+        if arrival - self._begin >= _SPAN_S:
+            if self._lates:
+                self._end_span(np.array(self._lates))
+            self._begin, self._lates = arrival, []
+        self._lates.append(late)
+
+    def _end_span(self, late: FloatArray) -> None:
+        early = late[late < late.min() + _EARLY_PERIODS]  # a delay says nothing of the age
+        self._means.append(complex(np.exp(2j * np.pi * early).mean()))
+        means = np.array(self._means)
+        alike = np.real(means[1:] * means[:-1].conj())
+        self.locked = len(alike) > 0 and float(alike.mean()) > _LOCKED
+
+
 class _Reference:
     """The line below the arrivals since the start, or since a pause of the trigger.
 
@@ -298,10 +334,12 @@ class _Reference:
         self.proven = False
         self.begin = self.confirmed = self._judged = 0.0
         self.found = 0
+        self._phases = _Phases()
 
     def confirms(self, due: float, arrival: float) -> bool:
         """Return whether no trigger was missed before this arrival, as far as can be seen."""
         late = arrival - due
+        self._phases.add(late / self._period, arrival)
         width = _FIRST_S if not self.proven and len(self._earliest) < _FIRST_SPANS else _SPAN_S
         if self._earliest and arrival - self._earliest[-1][0] < width:
             begin, least = self._earliest[-1]
@@ -317,7 +355,9 @@ class _Reference:
         self.begin = self.begin or arrival
         excess = self.excess(due, arrival)
         # The drift of crystals makes a line uncertain that is not confirmed any more.
-        limit = self._limit - 2 * _DRIFT_SIGMA * (arrival - self.confirmed)
+        aged = not self._phases.locked or not self.seen_from
+        limit = self._limit if aged else _AGE_PERIODS * self._period
+        limit -= 2 * _DRIFT_SIGMA * (arrival - self.confirmed)
         if not self.proven or self.found or excess > limit or limit <= 0:
             return False
         self.confirmed = arrival
@@ -385,6 +425,9 @@ class _Reference:
         begin, late = np.array(self._earliest).T
         since = begin - begin[-1]
         *_, rest, unlikely = _line_below(since, late)
+        if self._phases.locked:  # an age that changes by a period looks like a step
+            off = (rest[:_SHOWING].min(), np.median(rest), rest[-_SHOWING:].min())
+            return 0 if max(off) <= _AGE_PERIODS * self._period else None
         none, found = _edge(rest / self._period) - unlikely, []
         level = late - self._line[1] * since
         for at in range(max(first, 1), len(late)):

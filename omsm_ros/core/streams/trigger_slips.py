@@ -6,7 +6,8 @@ distance at equal counts; after a slip it is a whole number of sample periods.
 
 The median skew of about a second is judged every 0.2 s. A slip begins at
 ``|median| >= period / 2 + tolerance + 3 scatter``. It ends at
-``|median| < period / 2 + tolerance``. Between the two the last verdict holds. The scatter is that
+``|median| < period / 2 + tolerance``. Between the two the last verdict holds; before the first one
+the pairs wait, and after ten seconds it is a slip. The scatter is that
 within the second, or that over the last half minute if it is larger, because a driver's clock
 wanders while it is estimated from arrivals. The error of that estimate is bounded by its movement:
 the earliest of n arrivals is late by about 1/n of their scatter, so it was by k/n of that when
@@ -79,7 +80,8 @@ EQUAL_COUNTS = CommonTrigger()
 _SAME_NS = 2.0
 # Samples without a partner that show that the counters do not agree [s].
 _APART_S = 2.0
-# Time after which pairs are released without a first verdict, where blocks are too long [s].
+# Time after which pairs are released without a first verdict, where blocks are too long, and after
+# which a skew that may be that of a slip is one [s].
 _MOST_WAIT_S = 10.0
 
 
@@ -227,16 +229,23 @@ class TriggerSlipDetector:
         found = self._verdict(rows[:, 1] / self._period_ns)
         if found.samples and len(rows) >= _SURE_STAMPS:
             self._state = self.found = found
-        return bool(found.samples)
+        return bool(found.samples) or (self._starting and self._in_doubt(rows[:, 1]))
 
     def _agreed_until(self, count: int, period_ns: float) -> int:
         """Return the count up to which stamps have shown that there is no slip."""
         per_s = NANOSECONDS_PER_S / period_ns
-        if self._starting and count - self._start <= _MOST_WAIT_S * per_s:
+        if self._starting and not self._overdue(count):
             return self._start
         self._starting = False
         odd = count - self._odd_at <= _SPAN_S * per_s
         return self._judged_to if odd else max(min(self._shown), self._judged_to)
+
+    def _overdue(self, count: int) -> bool:
+        return (count - self._start) * self._period_ns > _MOST_WAIT_S * NANOSECONDS_PER_S
+
+    def _in_doubt(self, skew: FloatArray) -> bool:
+        """Return whether ``skew`` (n,) [ns], if it is no slip, may be that of one."""
+        return abs(median(skew)) >= self._steady() * self._period_ns
 
     def _next(self, end: int) -> int:
         pairs = zip(self._lines, self.sessions, strict=True)
@@ -302,6 +311,10 @@ class TriggerSlipDetector:
                 self._starting, self._judged_to = False, count  # stamps show nothing
         else:
             self._state = self._verdict(rows[:, 1] / self._period_ns)
+            if self._starting and not self._state.samples and self._in_doubt(rows[:, 1]):
+                if not self._overdue(count):
+                    return
+                self._state = self._verdict(rows[:, 1] / self._period_ns, above=0.0)
             self._starting, self._judged_to = False, int(rows[0, 0])
             self._odd = bool(np.any(self._off(rows[:, 1])))
             self.found = self._state if self._state.samples else self.found
@@ -324,11 +337,15 @@ class TriggerSlipDetector:
         )
         return self._steady() + _SEVERAL_TIMES * scatter
 
-    def _verdict(self, window: FloatArray) -> TriggerSlip:
+    def _verdict(self, window: FloatArray, above: float | None = None) -> TriggerSlip:
+        """Return the verdict on the skews ``window`` (n,) [samples].
+
+        above: by how much a slip exceeds that of stamps without scatter; None by their scatter
+        """
         limit, skew, steady = self._limit(window), median(window), self._steady()
-        period, above = self._period_ns / NANOSECONDS_PER_S, limit - steady
-        if self._state.samples:
-            above = 0.0
+        period = self._period_ns / NANOSECONDS_PER_S
+        if above is None:
+            above = 0.0 if self._state.samples else limit - steady
         found = TriggerSlip.judged(skew, period, self._trigger, steady + above)
         change = skew - self._usual / self._period_ns
         if abs(change) >= 0.5 + above:
