@@ -138,11 +138,9 @@ def _runs(kind: type, table: NDArray[np.void]) -> Iterator[Any]:
         )
 
 
+_BLOCKS = {AXES_TOPIC: AxisBlock, DISTANCE_TOPIC: DistanceBlock, REFERENCE_TOPIC: DistanceBlock}
 _TO_RECORD: dict[str, Callable[[Any], Any]] = {
-    AXES_TOPIC: message_mapping.axis_block,
-    DISTANCE_TOPIC: message_mapping.distance_block,
-    REFERENCE_TOPIC: message_mapping.distance_block,
-    ACCELERATION_TOPIC: message_mapping.acceleration_block,
+    **dict.fromkeys((*_BLOCKS, ACCELERATION_TOPIC), message_mapping.block_of),
     CALIBRATION_TOPIC: message_mapping.calibration,
     POINTS_TOPIC: message_mapping.cloud_array,
     PROBE_TOPIC: message_mapping.probe_settings,
@@ -152,12 +150,6 @@ _TO_RECORD: dict[str, Callable[[Any], Any]] = {
 
 # Other programs also use messages of other types, with any content.
 _OURS = "omsm_msgs/"
-
-_BLOCKS: dict[str, type] = {
-    AXES_TOPIC: AxisBlock,
-    DISTANCE_TOPIC: DistanceBlock,
-    REFERENCE_TOPIC: DistanceBlock,
-}
 
 BLOCK_TOPICS = frozenset(_BLOCKS)
 """Topics that :meth:`BagReader.blocks` joins."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import yaml
@@ -108,7 +108,6 @@ def _check_depth(value: object, left: int) -> None:
 
 MAX_DEPTH_STRICT_YAML = 8
 _LINES = "write 'name: value' lines, and quotes around a text with any of [ ] { } , : #"
-_Number = TypeVar("_Number")
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -144,13 +143,8 @@ class _PlainLoader(yaml.SafeLoader):
         mark: Any = where.start_mark
         raise yaml.constructor.ConstructorError(None, None, why, mark)
 
-    def construct_bounded_int(self, node: yaml.ScalarNode) -> int:
-        return self._number(node, bounded_integer)
-
-    def construct_finite_float(self, node: yaml.ScalarNode) -> float:
-        return self._number(node, finite_float)
-
-    def _number(self, node: yaml.ScalarNode, read: Callable[[str], _Number]) -> _Number:
+    def construct_number(self, node: yaml.ScalarNode) -> float:
+        read = bounded_integer if node.tag == _tag("int") else finite_float
         try:
             return read(node.value)
         except ValueError as err:
@@ -169,8 +163,8 @@ for _kind, _pattern, _first in (
     ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", list("-+.0123456789")),
 ):
     _PlainLoader.add_implicit_resolver(_tag(_kind), re.compile(rf"^(?:{_pattern})$"), _first)
-_PlainLoader.add_constructor(_tag("int"), _PlainLoader.construct_bounded_int)
-_PlainLoader.add_constructor(_tag("float"), _PlainLoader.construct_finite_float)
+_PlainLoader.add_constructor(_tag("int"), _PlainLoader.construct_number)
+_PlainLoader.add_constructor(_tag("float"), _PlainLoader.construct_number)
 
 
 def mapping_of(text: str, error: type[OmsmError], what: str) -> dict[str, Any]:

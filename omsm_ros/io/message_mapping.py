@@ -11,9 +11,9 @@ import array
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -35,13 +35,13 @@ from omsm_ros.units import NANOSECONDS_PER_S
 MAX_JSON_CHARACTERS = 2_000_000
 _SET = "calibration_set"
 
-T = TypeVar("T", AxisBlock, DistanceBlock, AccelerationBlock)
 CHANNELS: dict[Any, dict[str, Any]] = {
     AxisBlock: dict.fromkeys("xyzbc", np.float64),
     DistanceBlock: {"distance": np.float64, "intensity": np.float32, "status": np.uint8},
     AccelerationBlock: dict.fromkeys("xyz", np.float64),
 }
 """The sequences of the message of each kind of block, in their order on the wire."""
+_BLOCKS = {kind.__name__: kind for kind in CHANNELS}  # rosbags adds package and folder to a name
 _POINT_FIELD_TYPES = {"<f4": 7, "<f8": 8, "<u4": 6}  # sensor_msgs/PointField constants
 _PLACES: Mapping[str, Any] = POINT_DTYPE.fields or {}
 # Name, offset [bytes], type and count of each field of a point.
@@ -88,8 +88,9 @@ def stamp_of(message: Any) -> int:
     return int(stamp.sec) * NANOSECONDS_PER_S + int(stamp.nanosec)
 
 
-def block_of(kind: type[T], message: Any) -> T:
-    """Return the record of a message of blocks; DataError if its channels do not fit."""
+def block_of(message: Any) -> Any:
+    """Return the record of a message of samples; DataError if its channels do not fit."""
+    kind = _BLOCKS[type(message).__name__.rpartition("__")[2]]
     channels = {name: np.asarray(getattr(message, name), t) for name, t in CHANNELS[kind].items()}
     return kind(
         stamp_ns=stamp_of(message),
@@ -97,11 +98,6 @@ def block_of(kind: type[T], message: Any) -> T:
         sample_period=float(message.sample_period),
         **channels,
     )
-
-
-axis_block = partial(block_of, AxisBlock)
-distance_block = partial(block_of, DistanceBlock)
-acceleration_block = partial(block_of, AccelerationBlock)
 
 
 # Fields of the message of a calibration that its file has, too.

@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -48,13 +49,15 @@ class RunningMap:
 
     Memory does not depend on the number of points. Each change of a cell has a version, so that
     readers can get the changes since their last version.
+
+    grid: the present one, None before the first point;  version: of the newest change
     """
 
     def __init__(self, values: int, cells: int = 400) -> None:
         """values: number for each point;  cells: along a side, even."""
         self._values, self._cells = values, cells
-        self._grid: MapGrid | None = None
-        self._version = self._next_generation = 0
+        self.grid: MapGrid | None = None
+        self.version, self._generations = 0, count()
         self._early: list[tuple[FloatArray, FloatArray, FloatArray]] | None = []
         self._clear()
 
@@ -64,28 +67,11 @@ class RunningMap:
         self._sum = np.zeros((cells, cells, self._values))
         self._changed = np.zeros((cells, cells), np.int64)
 
-    @property
-    def grid(self) -> MapGrid | None:
-        """Return the present grid; None before the first point."""
-        return self._grid
-
-    @property
-    def version(self) -> int:
-        """Return the version of the newest change."""
-        return self._version
-
-    @property
-    def points(self) -> int:
-        """Return the number of points."""
-        return int(np.sum(self._count))
-
     def restart(self) -> None:
         """Remove all points, as before another scan."""
-        generation = 0 if self._grid is None else self._grid.generation + 1
         self._clear()
-        self._version += 1
-        self._grid, self._early = None, []
-        self._next_generation = generation
+        self.version += 1
+        self.grid, self._early = None, []
 
     def add(self, x: FloatArray, y: FloatArray, values: FloatArray) -> int:
         """Add ``values`` (n, k) at ``x``, ``y`` (n,) [m]; return the number of finite ones."""
@@ -94,7 +80,7 @@ class RunningMap:
         if not len(x):
             return 0
         self._keep_recent(x, y, values)
-        if self._grid is None or not self._in_range(x, y):
+        if self.grid is None or not self._in_range(x, y):
             if self._early is not None:
                 self._lay_out()
                 return len(x)
@@ -106,64 +92,58 @@ class RunningMap:
     def _keep_recent(self, x: FloatArray, y: FloatArray, values: FloatArray) -> None:
         if self._early is None:
             return
-        if self._grid is not None and sum(len(part) for part, *_ in self._early) > _EARLY_POINTS:
+        if self.grid is not None and sum(len(part) for part, *_ in self._early) > _EARLY_POINTS:
             self._early = None
             return
         self._early.append((x, y, values))
 
     def _enter(self, x: FloatArray, y: FloatArray, values: FloatArray) -> None:
-        assert self._grid is not None
-        column = ((x - self._grid.left) / self._grid.pitch).astype(np.intp)
-        row = ((y - self._grid.bottom) / self._grid.pitch).astype(np.intp)
-        self._version += 1
+        column = ((x - self.grid.left) / self.grid.pitch).astype(np.intp)
+        row = ((y - self.grid.bottom) / self.grid.pitch).astype(np.intp)
+        self.version += 1
         np.add.at(self._count, (row, column), 1)
         np.add.at(self._sum, (row, column), values)
-        self._changed[row, column] = self._version
+        self._changed[row, column] = self.version
 
     def _lay_out(self) -> None:
-        assert self._early is not None
         x, y, values = (np.concatenate(parts) for parts in zip(*self._early, strict=True))
         span = max(float(np.ptp(x)), float(np.ptp(y)), _LEAST_SPAN_M) * _MARGIN
         left = (float(x.min()) + float(x.max()) - span) / 2
         bottom = (float(y.min()) + float(y.max()) - span) / 2
-        if self._grid is not None:
-            self._next_generation = self._grid.generation + 1
-        self._grid = MapGrid(left, bottom, span / self._cells, self._cells, self._next_generation)
+        self.grid = MapGrid(left, bottom, span / self._cells, self._cells, next(self._generations))
         self._clear()
         self._enter(x, y, values)
 
     def _in_range(self, x: FloatArray, y: FloatArray) -> bool:
-        assert self._grid is not None
-        size = self._grid.pitch * self._cells
-        right, top = self._grid.left + size, self._grid.bottom + size
+        size = self.grid.pitch * self._cells
+        right, top = self.grid.left + size, self.grid.bottom + size
         return bool(
-            x.min() >= self._grid.left
-            and y.min() >= self._grid.bottom
+            x.min() >= self.grid.left
+            and y.min() >= self.grid.bottom
             and x.max() < right
             and y.max() < top
         )
 
     def _double(self, x: FloatArray, y: FloatArray) -> None:
         """Merge groups of four cells into one quarter of the grid, so that the new points fit."""
-        old = self._grid
-        assert old is not None
+        old = self.grid
         half, size = self._cells // 2, old.pitch * self._cells
         to_left = bool(x.min() < old.left)
         below = bool(y.min() < old.bottom)
-        count = self._count.reshape(half, 2, half, 2).sum(axis=(1, 3))
+        points = self._count.reshape(half, 2, half, 2).sum(axis=(1, 3))
         total = self._sum.reshape(half, 2, half, 2, self._values).sum(axis=(1, 3))
         self._clear()
         rows = slice(half, None) if below else slice(0, half)
         columns = slice(half, None) if to_left else slice(0, half)
-        self._count[rows, columns], self._sum[rows, columns] = count, total
-        self._version += 1
-        self._changed[rows, columns] = np.where(count > 0, self._version, 0)
-        self._grid = MapGrid(
+        self._count[rows, columns], self._sum[rows, columns] = points, total
+        self.version += 1
+        self._changed[rows, columns] = np.where(points > 0, self.version, 0)
+        self.grid = MapGrid(
             old.left - size * to_left,
             old.bottom - size * below,
             2 * old.pitch,
             self._cells,
-            old.generation + 1,
+            next(self._generations),
         )
 
     def since(self, version: int) -> tuple[IntArray, NDArray[np.float32]]:
@@ -172,8 +152,8 @@ class RunningMap:
         With another generation of the grid, ``version`` must be 0.
         """
         place = np.flatnonzero(self._changed.ravel() > version)
-        count = self._count.ravel()[place]
-        means = self._sum.reshape(-1, self._values)[place] / count[:, np.newaxis]
+        means = self._sum.reshape(-1, self._values)[place]
+        means /= self._count.ravel()[place][:, np.newaxis]
         return place, means.astype(np.float32)
 
 

@@ -100,9 +100,8 @@ class CalibratorNode(ManagedNode):
             listen(self, undo, kind, topic, partial(self._keep, topic))
 
     def _keep(self, topic: str, message: AxisBlock | DistanceBlock, _: MessageInfo) -> None:
-        convert = message_mapping.axis_block if topic == "axes" else message_mapping.distance_block
         try:
-            self._buffers[topic].add(convert(message))
+            self._buffers[topic].add(message_mapping.block_of(message))
         except OmsmError as err:
             self._refused[topic] += 1
             self.get_logger().warning(f"block refused: {err}", throttle_duration_sec=5.0)

@@ -358,9 +358,8 @@ class CorrectorNode(ManagedNode):
             )
             return
         self._state.arrived(info["received_timestamp"])
-        convert = message_mapping.axis_block if stream == "axes" else message_mapping.distance_block
         try:
-            block = convert(message)
+            block = message_mapping.block_of(message)
             self._waiting[stream].append(block)
             if self._motion:
                 self._motion.add(block)

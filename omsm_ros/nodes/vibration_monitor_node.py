@@ -84,7 +84,7 @@ class VibrationMonitorNode(ManagedNode):
 
     def _take(self, message: Any, _: MessageInfo) -> None:
         try:
-            block = message_mapping.acceleration_block(message)
+            block = message_mapping.block_of(message)
             self._running.push(block)
         except OmsmError as err:
             self._refused = str(err)

@@ -73,7 +73,7 @@ class ViewerNode(ManagedNode):
         view, convert = self._view, message_mapping
         shows = partial(self._show, convert.cloud_array, view.add_points)
         listen(self, undo, PointCloud2, "points", shows)
-        shows = partial(self._show, convert.acceleration_block, view.add_acceleration)
+        shows = partial(self._show, convert.block_of, view.add_acceleration)
         listen(self, undo, AccelerationBlock, "acceleration", shows)
         shows = partial(self._show, convert.calibration, view.set_calibration)
         listen(self, undo, Calibration, "calibration", shows, LATCHED_QOS)

@@ -32,9 +32,7 @@ def test_the_distance_of_a_message_is_nan_where_its_status_is_not_ok():
     message = message_mapping.block_message(bag_messages(), block)
     np.testing.assert_array_equal(message.distance, [1e-6, np.nan, 3e-6])
     message.distance = np.array([1e-6, 2e-6, 3e-6])
-    np.testing.assert_array_equal(
-        message_mapping.distance_block(message).distance, [1e-6, np.nan, 3e-6]
-    )
+    np.testing.assert_array_equal(message_mapping.block_of(message).distance, [1e-6, np.nan, 3e-6])
 
 
 @pytest.mark.parametrize("name", sorted(typestore().types))

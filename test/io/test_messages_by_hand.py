@@ -130,7 +130,7 @@ def test_axes_are_the_bytes_of_the_standard(block, frame):
         message_mapping.block_message(bag_messages(), block, frame), "omsm_msgs/msg/AxisBlock"
     )
     assert ours.rstrip(b"\0") == raw.rstrip(b"\0")
-    same(message_mapping.axis_block(read(raw, "omsm_msgs/msg/AxisBlock")), block)
+    same(message_mapping.block_of(read(raw, "omsm_msgs/msg/AxisBlock")), block)
 
 
 @settings(max_examples=40)
@@ -141,7 +141,7 @@ def test_distances_are_the_bytes_of_the_standard(block, frame):
     kind = "omsm_msgs/msg/DistanceBlock"
     ours = written(message_mapping.block_message(bag_messages(), block, frame), kind)
     assert ours.rstrip(b"\0") == raw.rstrip(b"\0")
-    same(message_mapping.distance_block(read(raw, kind)), block)
+    same(message_mapping.block_of(read(raw, kind)), block)
 
 
 @pytest.mark.parametrize("count", [1, 2, 7])
@@ -154,7 +154,7 @@ def test_accelerations_are_the_bytes_of_the_standard(count):
     raw, kind = acceleration_by_hand(block, "probe"), "omsm_msgs/msg/AccelerationBlock"
     ours = written(message_mapping.block_message(bag_messages(), block), kind)
     assert ours.rstrip(b"\0") == raw.rstrip(b"\0")
-    same(message_mapping.acceleration_block(read(raw, kind)), block)
+    same(message_mapping.block_of(read(raw, kind)), block)
 
 
 def test_a_calibration_is_the_bytes_of_the_standard(true_calibration):

@@ -17,7 +17,7 @@ def test_a_line_of_vibration_arrives_with_its_size(cell):
     address = "synthetic://?frequency=125&amplitude=0.05&noise=0.001"
     cell.processes.start("accelerometer_driver", port=address, sample_period=5e-4, block_size=200)
     cell.wait("four thousand samples", lambda: len(heard) >= 20)
-    blocks = [message_mapping.acceleration_block(message) for message in heard[:20]]
+    blocks = [message_mapping.block_of(message) for message in heard[:20]]
     firsts = np.array([block.first_sample for block in blocks])
     assert np.all(np.diff(firsts) == 200)
     x = np.concatenate([block.x for block in blocks])
