@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import special
 
 from omsm_ros.core.ripple.ripple_guard import NamedLine
@@ -30,12 +31,12 @@ _DOUBTFUL = 9.0
 _SAME_WAVE, _MOST_SAMPLES = 0.02, 500
 
 
-def exposure_share(passing: FloatArray, exposure: float) -> float:
-    """Return the share of an amplitude that ``exposure`` [s] leaves [1].
+def exposure_share(passing: FloatArray, exposure: ArrayLike) -> FloatArray:
+    """Return the share of an amplitude that ``exposure`` [s] leaves [1], of its shape.
 
     passing: frequency at which the texture passes, at samples of the scan (m,) [Hz]
     """
-    return float(abs(np.mean(np.sinc(passing * exposure))))
+    return np.asarray(abs(np.mean(np.sinc(np.multiply.outer(exposure, passing)), axis=-1)))
 
 
 def spot_share(wavelength: float, spot: float) -> float:
@@ -88,12 +89,12 @@ class Exposure:
         if not (self.resolved or self.declared):
             return None
         part = spot_share(wavelength, spot)
-        share = part * exposure_share(passing, self.seconds)
+        share = part * float(exposure_share(passing, self.seconds))
         if share < _LEAST_SHARE:
             return None
-        ends = [
-            exposure_share(passing, max(self.seconds + s * self.uncertainty, 0)) for s in (-1, 1)
-        ]
+        ends = exposure_share(
+            passing, np.maximum(self.seconds + self.uncertainty * np.array([-1, 1]), 0.0)
+        )
         on_part = amplitude / share
         return on_part, float(np.hypot(sigma / share, on_part * part * np.ptp(ends) / 2 / share))
 
@@ -143,7 +144,7 @@ def _misfit(textures: Sequence[PassingTexture], trial: FloatArray) -> FloatArray
     """Return χ² (k,) at each ``trial`` (k,) [s], with the best amplitudes on the part."""
     total = np.zeros(len(trial))
     for texture in textures:
-        share = np.array([[exposure_share(p, t) for t in trial] for p in texture.passing])
+        share = np.array([exposure_share(p, trial) for p in texture.passing])
         weight = 1 / texture.uncertainty[:, np.newaxis] ** 2
         wanted = texture.amplitude[:, np.newaxis]
         on_part = np.sum(weight * share * wanted, axis=0) / np.sum(weight * share**2, axis=0)
