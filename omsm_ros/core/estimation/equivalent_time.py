@@ -173,13 +173,16 @@ class _ProbeFit:
     step: float
 
     def _through(self, pole: complex, at: FloatArray) -> list[FloatArray]:
-        """Return the edge through 1/(s - p) at places ``at``, linear between values of the grid."""
-        from scipy.interpolate import CubicSpline
-
+        """Return the edge, linear between values of the grid, through 1/(s - p) at ``at`` (m,)."""
         grown = np.exp(pole * self.step)
         end = (grown - 1 - pole * self.step) / (pole**2 * self.step)
-        b = abs(pole) * np.array([end, (grown - 1) / pole - end])
-        moved = CubicSpline(self.grid, signal.lfilter(b, [1.0, -grown], self.command + 0j))(at)
+        b = np.array([end, (grown - 1) / pole - end])
+        moved = signal.lfilter(b, [1.0, -grown], self.command + 0j)
+        before = np.minimum((at - self.grid[0]) * _FINE, len(self.grid) - 2).astype(np.int64)
+        after = (at - self.grid[before]) * _FINE * self.step * pole
+        change = np.diff(self.command)[before] / (self.step * pole)
+        driven = self.command[before] * np.expm1(after) + change * (np.expm1(after) - after)
+        moved = abs(pole) * (moved[before] * np.exp(after) + driven / pole)
         return [moved.real, moved.imag] if pole.imag else [moved.real]
 
     def residual(self, p: FloatArray) -> FloatArray:
