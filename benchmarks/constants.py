@@ -37,7 +37,6 @@ _PLACES = {
     "_CLEARLY": f"{_ESTIMATION}.noise",
     "_INTERVAL": f"{_ESTIMATION}.noise",
     "_DAMPED_BEYOND": f"{_ESTIMATION}.model_order",
-    "_GUESSED_RATE": f"{_ESTIMATION}.model_order",
     "_LINEAR_ITERATIONS": f"{_ESTIMATION}.model_order",
     "_ADDED_POLE": f"{_ESTIMATION}.model_order",
     "_BRIDGE_S": f"{_ESTIMATION}.output_error",
@@ -58,7 +57,6 @@ _PLACES = {
     "_HALF_WIDTH": f"{_ROOT}.residual_diagnostics",
     "FALSE_ALARM": f"{_ROOT}.residual_diagnostics",
     "_LAGS": f"{_ROOT}.residual_diagnostics",
-    "_HINT": f"{_ROOT}.undetected",
     "_LEAST_LIKELY": f"{_ROOT}.undetected",
     "_LITTLE": f"{_ROOT}.undetected",
     "_ALIKE_BIC": f"{_IDENTIFICATION}.model_choice",
@@ -66,7 +64,6 @@ _PLACES = {
     "_MOST_ROUNDS": f"{_IDENTIFICATION}.model_error_search",
     "_UNDECIDED": f"{_IDENTIFICATION}.model_error_search",
     "_LEAST_DECAYS": f"{_IDENTIFICATION}.model_error_search",
-    "_PLAIN_POLES": f"{_IDENTIFICATION}.model_error_search",
     "_SETTLED_DECAYS": f"{_IDENTIFICATION}.model_error_search",
 }
 

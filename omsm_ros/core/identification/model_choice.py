@@ -101,39 +101,18 @@ def choose_model(
     problem = prepared.problem
     budget = budget or EvaluationBudget()
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget)
-    points, before = StartingPoints(problem, lag, budget), None
+    points = StartingPoints(problem, lag, budget)
     if points.coarser is not None:
         model = _chosen_on_subset(prepared, points.coarser, lag, budget, order)
-        before = model.chosen.fit
-        if follows_beyond(problem, before, points.coarser.problem) > _NO_FURTHER_GAIN:
-            return model
-        if budget.stops():
+        beyond = follows_beyond(problem, model.chosen.fit, points.coarser.problem)
+        if beyond > _NO_FURTHER_GAIN or budget.stops():
             return model
 
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
         return fit(problem, structure, points.of(structure, smaller), budget=budget)
 
     colour = noise_colour(problem, lag, prepared.steps)
-    found = _model(problem, explore(fit_structure, order, colour, budget), order)
-    return found if before is None else keep_better(problem, found, before, budget)
-
-
-def keep_better(
-    problem: Problem, found: ChosenModel, before: Fit, budget: EvaluationBudget
-) -> ChosenModel:
-    """Return ``found``, or the structure of ``before`` where ``found`` was cut short and is worse.
-
-    before: fitted to the problem as it was. Where the budget is exhausted, its structure may not be
-        among those tried for ``found``.
-    """
-    if not budget.exhausted:
-        return found
-    again = fit(problem, before.structure, [before.nonlinear], budget=budget)
-    candidate = Candidate(again, information(again))
-    better = candidate.bic < information(found.chosen.fit)
-    if not better or not _identifiable(problem, [candidate]):
-        return found
-    return replace(found, chosen=candidate, candidates=[*found.candidates, candidate])
+    return _model(problem, explore(fit_structure, order, colour, budget), order)
 
 
 def rechosen(problem: Problem, before: ChosenModel, budget: EvaluationBudget) -> ChosenModel | None:

@@ -9,12 +9,10 @@ from omsm_ros.core.estimation.model_order import Candidate, StartingPoints, info
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
-from omsm_ros.core.identification.model_choice import ChosenModel, keep_better, rechosen
+from omsm_ros.core.identification.model_choice import ChosenModel, rechosen
 from omsm_ros.core.lti.transfer_function import Structure
 
 from .recorded_motions import record_of, recorded
-
-EXHAUSTED = EvaluationBudget(evaluations=10**6)
 
 
 @pytest.fixture(scope="module")
@@ -24,44 +22,6 @@ def fitted():
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
     two = Structure(2, 1, False)
     return problem, lag, fit(problem, two, StartingPoints(problem, lag).of(two, [lag]))
-
-
-def chosen(found):
-    candidate = Candidate(found, information(found))
-    return ChosenModel(candidate, [candidate])
-
-
-def test_where_not_all_was_tried_the_structure_before_stays(fitted):
-    problem, lag, two = fitted
-    kept = keep_better(problem, chosen(lag), two, EXHAUSTED)
-    assert kept.chosen.fit.structure == two.structure
-    assert kept.chosen.fit.sum_of_squares <= two.sum_of_squares * (1 + 1e-9)
-    assert kept.candidates[-1] is kept.chosen
-
-
-def test_it_is_fitted_to_the_problem_as_it_is_now(fitted):
-    problem, lag, two = fitted
-    line = 30e-9 * np.sin(2 * np.pi * 40.0 * problem.period * np.arange(len(problem.used)))
-    changed = replace(
-        problem,
-        output=problem.output + line,
-        background=np.column_stack([problem.background, line]),
-    )
-    kept = keep_better(changed, chosen(lag), two, EXHAUSTED).chosen.fit
-    assert kept.background[-1] == pytest.approx(1.0, abs=0.05)
-    assert kept.rms == pytest.approx(two.rms, rel=0.01)
-
-
-def test_what_describes_more_is_not_given_up(fitted):
-    problem, lag, two = fitted
-    found = chosen(two)
-    assert keep_better(problem, found, lag, EXHAUSTED) is found
-
-
-def test_where_all_was_tried_the_choice_stands(fitted):
-    problem, lag, two = fitted
-    found = chosen(lag)
-    assert keep_better(problem, found, two, EvaluationBudget()) is found
 
 
 def among(lag, two):
