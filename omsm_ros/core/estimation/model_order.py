@@ -7,8 +7,7 @@ Alternatives that changed nothing are in ``docs/design/identification-ablation.m
 
 A fit starts at two points, because the output error has local minima: at the best fit of a smaller
 structure, so that a larger one never fits worse, and at the result of iterated linear least
-squares, which finds resonances. A long record is first fitted to a decimated
-one, at the bandwidth of its motion; the best minimum there is the start.
+squares, which finds resonances.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from scipy import signal
 
 from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
-from omsm_ros.core.estimation.output_error import Fit, Problem, fit
+from omsm_ros.core.estimation.output_error import Fit, Problem
 from omsm_ros.core.lti.transfer_function import (
     ComplexArray,
     Structure,
@@ -185,19 +184,14 @@ _HALF_TAPS, _PASSES, _STOPPING_SHAPE = 24, 0.88, 9.0
 class StartingPoints:
     """Propose nonlinear parameters ψ for the structures of one problem.
 
-    pure_delay: the fit of a delay alone;  budget: counts the evaluations, if given
+    pure_delay: the fit of a delay alone
     """
 
     problem: Problem
     pure_delay: Fit
-    budget: EvaluationBudget | None = None
 
     def of(self, structure: Structure, smaller: Sequence[Fit]) -> list[FloatArray]:
         """Return ψ of ``structure``, given the fits made so far."""
-        if self.coarser is not None and structure.poles:
-            coarse = self.coarser
-            starts = coarse.of(structure, smaller)
-            return [fit(coarse.problem, structure, starts, budget=self.budget).nonlinear]
         scaled = ScaledStructure(structure, self.problem.rate)
         delay = float(self.pure_delay.nonlinear[-1]) if self.pure_delay.structure.delay else 0.0
         if structure.poles == 0:
@@ -208,16 +202,6 @@ class StartingPoints:
         if contained:
             found.append(_grown(scaled, min(contained, key=lambda f: f.sum_of_squares), delay))
         return found
-
-    @cached_property
-    def coarser(self) -> StartingPoints | None:
-        """Those of the decimated problem; None if the record is short or the motion fast."""
-        problem = self.problem
-        per_content = np.pi / (problem.rate * problem.period) / ABOVE_CONTENT
-        every = int(min(problem.closed_length / ENOUGH_SAMPLES, per_content))
-        if every <= 1:
-            return None
-        return replace(self, problem=coarser(problem, every))
 
     @cached_property
     def _probe(self) -> ComplexArray:
@@ -252,6 +236,12 @@ class StartingPoints:
                 break
             poles = found
         return poles
+
+
+def decimation(problem: Problem) -> int:
+    """Return how many samples may be one: 1 for a short record or a fast motion."""
+    per_content = np.pi / (problem.rate * problem.period) / ABOVE_CONTENT
+    return max(int(min(problem.closed_length / ENOUGH_SAMPLES, per_content)), 1)
 
 
 def coarser(problem: Problem, every: int) -> Problem:

@@ -16,6 +16,8 @@ from omsm_ros.core.estimation.model_order import (
     Candidate,
     StartingPoints,
     choose,
+    coarser,
+    decimation,
     explore,
     identifiable,
     information,
@@ -67,13 +69,11 @@ def has_initial_response(
     return bool(explained * fitted.samples > colour * _CLEARLY_SHOWN * max(size, 1) * rest)
 
 
-# Difference of the criterion on fewer samples beyond which a structure is not chosen on all. The
-# chosen structure is within one parameter of the best, at most 14.
+# Difference of the criterion beyond which a structure is not chosen whatever the change. The chosen
+# structure is within one parameter of the best, at most 14.
 _MAY_BE_CHOSEN_BIC = 30.0
 # "Not worth more than a bare mention" (Kass and Raftery 1995).
 _ALIKE_BIC = 2.0
-# Further iterations of a fit that starts at the minimum over fewer samples.
-_NEARLY_EVALUATIONS = 2
 # p-value below which content beyond the decimated bandwidth determines the model further.
 _NO_FURTHER_GAIN = 0.01
 
@@ -98,21 +98,27 @@ def choose_model(
     budget: of the evaluations; None for a budget of its own
     order: number of poles, 0 to choose it. The free choice is made in any case.
     """
-    problem = prepared.problem
-    budget = budget or EvaluationBudget()
+    return _model(prepared.problem, _explored(prepared, order, budget or EvaluationBudget()), order)
+
+
+def _explored(prepared: Prepared, order: int, budget: EvaluationBudget) -> Sequence[Candidate]:
+    """Return fits of rising order; to a long record, those that fewer of its samples lead to."""
+    problem, steps = prepared.problem, prepared.steps
+    if (every := decimation(problem)) > 1:
+        coarse = coarser(problem, every)
+        moving = replace(steps, moving=steps.moving[::every])
+        fewer = _explored(replace(prepared, problem=coarse, steps=moving), order, budget)
+        found = _on_all_samples(prepared, fewer, order, budget)
+        chosen = _model(problem, found, order).chosen.fit
+        if follows_beyond(problem, chosen, coarse) > _NO_FURTHER_GAIN or budget.stops():
+            return found
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget)
-    points = StartingPoints(problem, lag, budget)
-    if points.coarser is not None:
-        model = _chosen_on_subset(prepared, points.coarser, lag, budget, order)
-        beyond = follows_beyond(problem, model.chosen.fit, points.coarser.problem)
-        if beyond > _NO_FURTHER_GAIN or budget.stops():
-            return model
+    points = StartingPoints(problem, lag)
 
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
         return fit(problem, structure, points.of(structure, smaller), budget=budget)
 
-    colour = noise_colour(problem, lag, prepared.steps)
-    return _model(problem, explore(fit_structure, order, colour, budget), order)
+    return explore(fit_structure, order, noise_colour(problem, lag, steps), budget)
 
 
 def rechosen(problem: Problem, before: ChosenModel, budget: EvaluationBudget) -> ChosenModel | None:
@@ -150,52 +156,22 @@ def _model(problem: Problem, explored: Sequence[Candidate], order: int) -> Chose
     return ChosenModel(choose(asked), asked, free)
 
 
-def _chosen_on_subset(
-    prepared: Prepared, points: StartingPoints, lag: Fit, budget: EvaluationBudget, order: int
-) -> ChosenModel:
-    """Explore structures at the samples of ``points``; fit to all those that may be chosen.
-
-    lag: the fit of a delay alone to all samples
-    A structure far from the best there is evaluated with all samples at its minimum over fewer.
-    """
-    problem, coarse = prepared.problem, points.problem
-    every = round(coarse.period / problem.period)
-    steps = replace(prepared.steps, moving=prepared.steps.moving[::every])
-    delay = fit(coarse, lag.structure, [lag.nonlinear], budget=budget)
-    fewer = replace(points, pure_delay=delay)
-
-    def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
-        return fit(coarse, structure, fewer.of(structure, smaller), budget=budget)
-
-    colour = noise_colour(coarse, fewer.pure_delay, steps)
-    found = explore(fit_structure, order, colour, budget)
-    best = min(c.bic for c in found)
-    price = noise_colour(problem, lag, prepared.steps)
-
-    def candidate(fitted: Fit) -> Candidate:
-        return Candidate(fitted, information(fitted, price))
-
-    explored = [
-        candidate(
-            fit(problem, c.fit.structure, [c.fit.nonlinear], _NEARLY_EVALUATIONS, budget=budget)
-            if c.bic < best + _MAY_BE_CHOSEN_BIC
-            else evaluated(problem, c.fit.structure, c.fit.nonlinear)
+def _on_all_samples(
+    prepared: Prepared, fewer: Sequence[Candidate], order: int, budget: EvaluationBudget
+) -> list[Candidate]:
+    """Return fits of ``fewer`` samples that may be chosen fitted to all, the others evaluated."""
+    problem, fits = prepared.problem, list[Fit]()
+    best = min(c.bic for c in fewer) + _MAY_BE_CHOSEN_BIC
+    for c in fewer:
+        structure, nonlinear = c.fit.structure, c.fit.nonlinear
+        may_be = c.bic < best or structure.poles == order
+        fits.append(
+            fit(problem, structure, [nonlinear], budget=budget)
+            if may_be
+            else evaluated(problem, structure, nonlinear)
         )
-        for c in found
-    ]
-    finished: set[Structure] = set()
-    while True:
-        model = _model(problem, explored, order)
-        chosen = {m.chosen.fit.structure for m in (model, model.free) if m is not None}
-        if chosen <= finished:
-            return model
-        explored = [
-            candidate(fit(problem, c.fit.structure, [c.fit.nonlinear], budget=budget))
-            if c.fit.structure in chosen - finished
-            else c
-            for c in explored
-        ]
-        finished |= chosen
+    colour = noise_colour(problem, min(fits, key=information), prepared.steps)
+    return [Candidate(each, information(each, colour)) for each in fits]
 
 
 def _identifiable(problem: Problem, candidates: Sequence[Candidate]) -> Sequence[Candidate]:

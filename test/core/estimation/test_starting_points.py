@@ -7,7 +7,6 @@ import pytest
 
 from omsm_ros.core.estimation.model_order import StartingPoints, coarser
 from omsm_ros.core.estimation.model_structure import ScaledStructure
-from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 
@@ -67,21 +66,6 @@ def test_every_start_has_the_nonlinear_of_its_structure_and_is_stable():
         for shape in starts:
             assert len(shape) == scaled.nonlinear_size
             assert scaled.transfer_function(shape, np.ones(1)).is_stable
-
-
-@pytest.mark.parametrize("lost", [(), range(5, 48_000, 7), range(9000, 9400)], ids=str)
-@pytest.mark.parametrize(("frequency", "damping"), [(30.0, 0.1), (140.0, 0.02)])
-def test_many_samples_start_where_fewer_of_them_lead(frequency, damping, lost):
-    points = points_for(resonance(frequency, damping), finer=12, lost=lost)
-    structure = Structure(2, 0, False)
-    (start,) = points.of(structure, [])
-    assert frequencies_of(points, structure, [start]) == pytest.approx([frequency], rel=1e-3)
-    budget = EvaluationBudget()
-    found = fit(points.problem, structure, [start], budget=budget)
-    assert 0 < budget.evaluations < 12
-    lines = np.array([5.0, 20.0, 60.0])
-    truth = resonance(frequency, damping).response(lines)
-    np.testing.assert_allclose(found.dynamics.response(lines), truth, rtol=1e-4)
 
 
 @pytest.mark.parametrize("every", [2, 3, 5])

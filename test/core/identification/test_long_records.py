@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from benchmarks.recorded import record_from_arrays
-from omsm_ros.core.estimation.model_order import StartingPoints, coarser
+from omsm_ros.core.estimation.model_order import coarser
 from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.estimation.preparation import prepare
+from omsm_ros.core.identification import model_choice
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import choose_model
 from omsm_ros.core.identification.residual_tests import follows_beyond
@@ -46,7 +47,7 @@ def test_fewer_samples_choose_what_all_would(of_mode, monkeypatch):
     prepared = prepare(of_mode, "encoder")
     fewer, every = EvaluationBudget(), EvaluationBudget()
     found = choose_model(prepared, fewer)
-    monkeypatch.setattr(StartingPoints, "coarser", None)
+    monkeypatch.setattr(model_choice, "decimation", lambda problem: 1)
     asked = choose_model(prepared, every)
     assert 0 < fewer.evaluations < every.evaluations
     assert found.chosen.fit.structure == asked.chosen.fit.structure
