@@ -62,6 +62,7 @@ _PLACES = {
     "_ALIKE_BIC": f"{_IDENTIFICATION}.model_choice",
     "_MAY_BE_CHOSEN_BIC": f"{_IDENTIFICATION}.model_choice",
     "_MOST_ROUNDS": f"{_IDENTIFICATION}.model_error_search",
+    "_PLAIN_POLES": f"{_IDENTIFICATION}.model_error_search",
     "_UNDECIDED": f"{_IDENTIFICATION}.model_error_search",
     "_LEAST_DECAYS": f"{_IDENTIFICATION}.model_error_search",
     "_SETTLED_DECAYS": f"{_IDENTIFICATION}.model_error_search",

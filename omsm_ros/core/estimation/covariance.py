@@ -11,19 +11,30 @@ from omsm_ros.linear_algebra import BLOCK_VALUES, orthonormal
 
 # Two orders for each of six lines of hum.
 _MAX_NOISE_ORDER = 12
+# Least share of the noise that counts as left by a fit.
+_LEAST_LEFT = 0.1
 # Directions of the parameter space weaker than this part of the strongest are lost in rounding.
 _RANK_TOLERANCE = 1e-11
 
 
-def autoregression(residual: FloatArray) -> tuple[FloatArray, float]:
+def autoregression(
+    residual: FloatArray, leverage: FloatArray | None = None
+) -> tuple[FloatArray, float]:
     """Return the whitening filter [1, a1 …] of a residual (n,) and the variance of its output.
 
     By Yule and Walker, order 0 to 12 chosen by BIC; order 0 is white.
+
+    leverage: see :func:`noise_spectrum`
     """
     n = len(residual)
     highest = min(_MAX_NOISE_ORDER, n - 1)
-    lagged = [residual[lag:] @ residual[: n - lag] for lag in range(highest + 1)]
-    lags = np.array(lagged, np.float64) / n
+    if leverage is None:
+        lagged = [residual[lag:] @ residual[: n - lag] for lag in range(highest + 1)]
+        lags = np.array(lagged, np.float64) / n
+    else:
+        length = 2 * len(leverage) - 2
+        power = np.abs(fft.rfft(residual, length)) ** 2 / np.maximum(1 - leverage, _LEAST_LEFT)
+        lags = np.asarray(fft.irfft(power, length)[: highest + 1] / n)
     coefficients: FloatArray = np.ones(1)
     variance = float(lags[0])
     if variance <= 0:
@@ -41,10 +52,30 @@ def autoregression(residual: FloatArray) -> tuple[FloatArray, float]:
     return np.asarray(best[1]), best[2]
 
 
-def noise_spectrum(residual: FloatArray, length: int) -> FloatArray:
-    """Return the autoregressive variance spectrum (``length`` // 2 + 1,) of a residual (n,)."""
-    coefficients, variance = autoregression(residual)
+def noise_spectrum(
+    residual: FloatArray, length: int, leverage: FloatArray | None = None
+) -> FloatArray:
+    """Return the autoregressive variance spectrum (``length`` // 2 + 1,) of a residual (n,).
+
+    leverage: share of the noise at each frequency that the fit took from the residual, see
+        :func:`leverage_of`; None where the fit has far fewer parameters than samples
+    """
+    coefficients, variance = autoregression(residual, leverage)
     return np.asarray(variance / np.abs(fft.rfft(coefficients, length)) ** 2)
+
+
+def leverage_of(basis: FloatArray, length: int) -> FloatArray:
+    """Return the share of white noise at each frequency that a fit takes, (``length`` // 2 + 1,).
+
+    basis: (r, n), orthonormal rows that span the columns of the fit
+
+    A fit has its parameters where the inputs have power, which is often where coloured noise is
+    strong. There its residual has less noise than elsewhere: one factor for all frequencies, of the
+    degrees of freedom, would understate it (as the leverage of MacKinnon and White 1985 does in
+    time).
+    """
+    taken = [np.abs(fft.rfft(row, length)) ** 2 for row in basis]
+    return np.asarray(np.sum(taken, axis=0) / basis.shape[1])
 
 
 def weighted_gram(rows: FloatArray, length: int, noise: FloatArray) -> FloatArray:

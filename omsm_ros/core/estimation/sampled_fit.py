@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 from scipy import fft, linalg, ndimage, signal
 
-from omsm_ros.core.estimation.covariance import noise_spectrum, weighted_gram
+from omsm_ros.core.estimation.covariance import leverage_of, noise_spectrum, weighted_gram
 from omsm_ros.core.estimation.impulse_response import AVERAGED_LINES, coherent_power
 from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.optimisation import Projection, descend
@@ -332,25 +332,33 @@ class SectionsProblem:
         It is the sandwich of the least squares in coloured noise, with the autocovariance of the
         residual of each record.
         """
-        order, size, start = fitted.order, fitted.linear.size, 0
+        order, size = fitted.order, fitted.linear.size
         gram = np.zeros((size + len(fitted.nonlinear), size + len(fitted.nonlinear)))
-        score = np.zeros_like(gram)
-        for one in self.spectra:
-            free = one.free(fitted.sections)
+        columns, frees = [], [one.free(fitted.sections) for one in self.spectra]
+        for one, free in zip(self.spectra, frees, strict=True):
             rows = one.driven(*self._inputs(one, fitted.nonlinear, order))
             slopes = self._slopes(one, free, fitted.nonlinear, order, fitted.linear)
-            rows = np.concatenate([rows - (rows @ free) @ free.T, slopes])
+            columns.append(np.concatenate([rows - (rows @ free) @ free.T, slopes]))
+            gram += columns[-1] @ columns[-1].T
+        scale = np.sqrt(np.maximum(np.diag(gram), 0.0))  # rounding may leave less than nothing
+        scale[scale == 0] = 1.0
+        values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
+        # A direction lost in rounding is as uncertain as the weakest.
+        values = np.maximum(values, _RANK_TOLERANCE * values[-1])
+        root = directions / np.sqrt(values) / scale[:, np.newaxis]
+        score, start = np.zeros_like(gram), 0
+        for one, free in zip(self.spectra, frees, strict=True):
+            basis = root.T @ columns.pop(0)
             residual = fitted.residual[start : start + len(one.places)]
             start += len(one.places)
-            spare = len(residual) / max(len(residual) - len(rows) - free.shape[1], 1)
-            on_grid = np.zeros((len(rows), len(one.record)))
-            on_grid[:, one.places] = rows
             length = fft.next_fast_len(len(one.record) + 64, real=True)
-            noise = noise_spectrum(residual * np.sqrt(spare), length)
-            gram += rows @ rows.T
-            score += weighted_gram(on_grid, length, noise)
-        turn = self._coefficient_jacobian(fitted, RATE / period)
-        found = turn @ _sandwich(gram, score) @ turn.T
+            length += length % 2
+            leverage = leverage_of(np.concatenate([basis, free.T]), length)
+            on_grid = np.zeros((len(basis), len(one.record)))
+            on_grid[:, one.places] = basis
+            score += weighted_gram(on_grid, length, noise_spectrum(residual, length, leverage))
+        turn = self._coefficient_jacobian(fitted, RATE / period) @ root
+        found = turn @ score @ turn.T
         return np.asarray(0.5 * (found + found.T))
 
     def _coefficient_jacobian(self, fitted: SectionsFit, unit: float) -> FloatArray:
@@ -447,18 +455,6 @@ def _inverse(gram: FloatArray) -> FloatArray:
     values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
     kept = values > _RANK_TOLERANCE * values[-1]
     root = directions[:, kept] / np.sqrt(values[kept]) / scale[:, np.newaxis]
-    return np.asarray(root @ root.T)
-
-
-def _sandwich(gram: FloatArray, score: FloatArray) -> FloatArray:
-    """Return gram⁻¹ score gram⁻¹; a direction lost in rounding is as uncertain as the weakest."""
-    scale = np.sqrt(np.maximum(np.diag(gram), 0.0))  # rounding may leave less than nothing
-    scale[scale == 0] = 1.0
-    values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
-    inverse = directions / np.maximum(values, _RANK_TOLERANCE * values[-1]) @ directions.T
-    powers, turned = np.linalg.eigh(score / np.outer(scale, scale))
-    # By a root, so that rounding leaves no negative variance.
-    root = inverse @ (turned * np.sqrt(np.maximum(powers, 0.0))) / scale[:, np.newaxis]
     return np.asarray(root @ root.T)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from omsm_ros.core.estimation.model_order import Candidate, information
 from omsm_ros.core.estimation.noise import correct_errors_in_variables
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
-from omsm_ros.core.estimation.output_error import evaluated, fit
+from omsm_ros.core.estimation.output_error import Fit, evaluated, fit
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.model_choice import ChosenModel, rechosen
 from omsm_ros.core.lti.transfer_function import Structure
@@ -35,7 +35,7 @@ from omsm_ros.core.model_errors.undetected import at_fitted_pole, fit_with_added
 # Rounds, each for one model error; a machine with more errors cannot be used to measure.
 _MOST_ROUNDS = 6
 _NUISANCE_FAMILIES = {BACKLASH, DRIFT, FRICTION, LINEARITY, PERIODIC, VIBRATION}
-# Families at reversals of the motion; each is modelled once.
+# Families whose columns depend on the fitted response, and improve it.
 _TURNING = {BACKLASH, FRICTION}
 _SLOW = {BACKLASH, CREEP, DRIFT, FRICTION, LINEARITY}
 # Log odds below which two families count as equal (Kass and Raftery 1995: very strong).
@@ -45,6 +45,8 @@ _LEAST_DECAYS = 1.0
 # Decay times in a record below which the start of the period contains the response to its end:
 # after seven a thousandth remains.
 _SETTLED_DECAYS = 7.0
+# Most poles of a simple model, a structure and its roll-off; nonlinearity looks like many more.
+_PLAIN_POLES = 2
 # Factors on the poles of a mode at which a fit starts: tested modes are six per cent apart.
 _MODE_FREQUENCY_RATIOS = (1.0, 0.97, 1.03)
 
@@ -96,7 +98,7 @@ def search_model_errors(
     search.refused |= set() if may_grow else {CREEP, MODE}
     diagnostics = search.diagnostics()
     for _ in range(_MOST_ROUNDS):
-        shown = diagnostics.significant(search.refused | search.turning)
+        shown = diagnostics.significant(search.refused | search.settled)
         # Without budget a nuisance term is still fitted to the structure that was chosen.
         if not shown or (search.budget.stops() and shown[0].term.family not in _NUISANCE_FAMILIES):
             break
@@ -108,7 +110,7 @@ def search_model_errors(
         diagnostics,
         search.nuisance_terms,
         search.grown,
-        diagnostics.significant(search.turning),
+        diagnostics.significant(search.settled),
         search.without,
         incomplete=search.budget.incomplete,
     )
@@ -119,6 +121,7 @@ class _Search:
     """The state of a search.
 
     refused: families whose poles were no improvement
+    settled: families whose columns were recomputed for the response
     grown, without: terms that became poles since the last nuisance term, and the diagnostics before
     """
 
@@ -128,13 +131,9 @@ class _Search:
     model: ChosenModel
     budget: EvaluationBudget
     refused: set[str] = field(default_factory=set)
+    settled: set[str] = field(default_factory=set)
     grown: list[ModelErrorTerm] = field(default_factory=list)
     without: list[ResidualDiagnostics] = field(default_factory=list)
-
-    @property
-    def turning(self) -> set[str]:
-        """Return the families at reversals that are modelled."""
-        return _TURNING & {modelled.term.family for modelled in self.nuisance_terms}
 
     def diagnostics(self) -> ResidualDiagnostics:
         """Return the diagnostics of the model."""
@@ -145,11 +144,19 @@ class _Search:
     def add(self, diagnostics: ResidualDiagnostics, shown: Sequence[ScoreTest]) -> bool:
         """Add the first of the model errors ``shown``; return False if it is refused."""
         columns = _select_nuisance_terms(diagnostics, shown)
-        if not columns:
+        present = {modelled.term.family for modelled in self.nuisance_terms}
+        again = {judged.term.family for judged in columns} & _TURNING & present
+        if again:
+            self.prepared, self.nuisance_terms = _recomputed_columns(
+                self.prepared, diagnostics, self.nuisance_terms, again
+            )
+            self.settled |= again
+        elif columns:
+            self.prepared, added = _with_columns(self.prepared, columns, self.nuisance_terms)
+            self.nuisance_terms = [*self.nuisance_terms, *added]
+            self.grown, self.without = [], []
+        else:
             return self._add_poles(diagnostics, shown[0].term)
-        self.prepared, added = _with_columns(self.prepared, columns, self.nuisance_terms)
-        self.nuisance_terms = [*self.nuisance_terms, *added]
-        self.grown, self.without = [], []
         self.prepared, self.model = self.choose(self.prepared, self.budget)
         return True
 
@@ -170,6 +177,11 @@ def _initial_model(
     prepared, nuisance_terms = _with_columns(prepared, _drift(prepared, budget))
     prepared, model = choose(prepared, budget)
     prepared, model, budget = _with_errors_in_variables(prepared, model, choose, budget)
+    columns = _modelled_as_poles(prepared, model, budget)
+    if columns:
+        prepared, added = _with_columns(prepared, columns, nuisance_terms)
+        nuisance_terms += added
+        prepared, model = choose(prepared, budget)
     return prepared, nuisance_terms, model, budget
 
 
@@ -217,6 +229,41 @@ def _detected_drift(diagnostics: ResidualDiagnostics) -> list[ScoreTest]:
     return [judged for judged in shown if judged.term.family == DRIFT]
 
 
+def _modelled_as_poles(
+    prepared: Prepared, model: ChosenModel, budget: EvaluationBudget
+) -> list[ScoreTest]:
+    """Return nuisance terms that ``model`` fits by poles: with them a simple model is better."""
+    chosen = model.chosen
+    plain = [c for c in model.candidates if c.fit.structure.poles <= _PLAIN_POLES]
+    if chosen.fit.structure.poles <= _PLAIN_POLES or not plain:
+        return []
+    best = min(plain, key=lambda candidate: candidate.bic).fit
+    diagnostics = ResidualDiagnostics(prepared.problem, best, prepared.steps, _NUISANCE_FAMILIES)
+    fewer = diagnostics.thinned
+    # If the decimated record shows none, all samples need not be tested.
+    if fewer is not None:
+        there = evaluated(fewer.problem, chosen.fit.structure, chosen.fit.nonlinear)
+        if not _improving_terms(prepared, fewer, there, budget):
+            return []
+    return _improving_terms(prepared, diagnostics, chosen.fit, budget)
+
+
+def _improving_terms(
+    prepared: Prepared, diagnostics: ResidualDiagnostics, chosen: Fit, budget: EvaluationBudget
+) -> list[ScoreTest]:
+    columns = _select_nuisance_terms(diagnostics, diagnostics.significant())
+    if not columns:
+        return []
+    plain, before = diagnostics.fitted, replace(prepared, problem=diagnostics.problem)
+    problem = _with_columns(before, columns)[0].problem
+    nuisance_terms = fit(problem, plain.structure, [plain.nonlinear], budget=budget)
+    further = problem.background.shape[1] - diagnostics.problem.background.shape[1]
+    better = information(nuisance_terms) + further * np.log(nuisance_terms.samples) < information(
+        chosen
+    )
+    return columns if better else []
+
+
 def _select_nuisance_terms(
     diagnostics: ResidualDiagnostics, shown: Sequence[ScoreTest]
 ) -> list[ScoreTest]:
@@ -250,6 +297,22 @@ def _with_columns(
         added.append(ModelledTerm(judged.term, slice(start, background.shape[1])))
     problem = replace(prepared.problem, background=background)
     return replace(prepared, problem=problem), added
+
+
+def _recomputed_columns(
+    prepared: Prepared,
+    diagnostics: ResidualDiagnostics,
+    nuisance_terms: Sequence[ModelledTerm],
+    families: set[str],
+) -> tuple[Prepared, list[ModelledTerm]]:
+    background, renewed = prepared.problem.background.copy(), []
+    for modelled in nuisance_terms:
+        term = modelled.term
+        if term.family in families:
+            term = diagnostics.model_errors.again(term)
+            background[:, modelled.columns] = term.columns
+        renewed.append(ModelledTerm(term, modelled.columns))
+    return replace(prepared, problem=replace(prepared.problem, background=background)), renewed
 
 
 def _grown(

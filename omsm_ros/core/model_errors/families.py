@@ -203,6 +203,13 @@ class ModelErrorFamilies:
             if not only or name in only:
                 yield from make()
 
+    def again(self, term: ModelErrorTerm) -> ModelErrorTerm:
+        """Return the ``term`` of another fit with its columns in this fit."""
+        for family in self.families((term.family,)):
+            for index in np.flatnonzero(family.parameters == term.parameter):
+                return family.term(int(index))
+        return term
+
     def alike(self, family: ModelErrorFamily) -> ModelErrorFamily:
         """Return the terms of ``family``, made for another fit of the record, for this fit."""
         if family.name == CREEP:

@@ -9,6 +9,7 @@ from scipy import signal
 from omsm_ros.core.estimation.covariance import (
     autoregression,
     inter_sample_motion_covariance,
+    leverage_of,
     noise_spectrum,
     parameter_covariance,
     weighted_gram,
@@ -303,3 +304,24 @@ def test_noise_through_rows_is_the_same_in_blocks_as_at_once(monkeypatch):
             monkeypatch.setattr("omsm_ros.core.estimation.covariance.BLOCK_VALUES", values)
             found = weighted_gram(rows, length, noise)
             np.testing.assert_allclose(found, 2.5 * rows @ rows.T, atol=1e-9)
+
+
+def test_a_fit_takes_noise_where_its_columns_have_power():
+    """Sixty slow columns of 600 samples leave less of slow noise than of other noise."""
+    rng, length = np.random.default_rng(4), 1024
+    slow = signal.butter(4, 0.5)
+    basis = np.linalg.qr(signal.lfilter(*slow, rng.normal(size=(60, 600))).T)[0].T
+    z = np.exp(-2j * np.pi * np.fft.rfftfreq(length))
+    truth = np.abs(1 + 0.8 * z + 0.3 * z**2) ** 2
+    leverage = leverage_of(basis, length)
+    mean = (2 * np.sum(leverage[1:-1]) + leverage[0] + leverage[-1]) / length
+    assert mean == pytest.approx(60 / 600, rel=1e-9)
+    low, by_leverage, by_degrees = slice(10, 200), [], []
+    for _ in range(60):
+        noise = signal.lfilter([1.0, 0.8, 0.3], [1.0], rng.normal(size=620))[20:]
+        left = noise - basis.T @ (basis @ noise)
+        by_leverage.append(np.mean((noise_spectrum(left, length, leverage) / truth)[low]))
+        one_factor = np.sqrt(600 / (600 - 60))
+        by_degrees.append(np.mean((noise_spectrum(one_factor * left, length) / truth)[low]))
+    assert np.mean(by_leverage) == pytest.approx(1.0, abs=0.03)
+    assert np.mean(by_degrees) < 0.95

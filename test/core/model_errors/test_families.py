@@ -250,6 +250,21 @@ class TestWhichFamilies:
         np.testing.assert_allclose(found[moved], np.array(lost)[moved], atol=0.03)
         assert start[0] == pytest.approx(-model_errors.fitted.gain)
 
+    def test_a_term_has_its_columns_in_another_fit(self, clean, step_test_of):
+        other = step_test_of.diagnostics(seed=9).model_errors
+        every = list(clean.model_errors.families((CREEP, PERIODIC, LINEARITY)))
+        assert len(every) == 3
+        for family in every:
+            term = family.term(0)
+            again = other.again(term)
+            assert (again.family, again.damping) == (term.family, term.damping)
+            if family.name == PERIODIC:  # its periods are parts of each fit's own travel
+                assert again is term
+            else:
+                assert again.parameter == term.parameter
+                scale = np.max(abs(term.columns))
+                np.testing.assert_allclose(again.columns, term.columns, atol=2e-3 * scale)
+
 
 def test_a_family_gives_its_terms_with_their_own_columns():
     columns = np.arange(12.0).reshape(2, 6)
