@@ -14,9 +14,8 @@ neighbouring lines, the residual is fitted by the inputs and the transient of th
 polynomial method, Pintelon et al. 2010). Lines of a periodic input also count one by one.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy import ndimage, special
@@ -97,21 +96,13 @@ def identify_samples(
     others = [other.response(frequency * period) for other in choice.alternatives]
     others_of = np.array([corrected, *others], np.complex128).transpose(1, 0, 2)
     valid = [valid_range(sections, blocks, frequency, i, each) for i, each in enumerate(others_of)]
-    entries = _entries(choice, sections, valid)
     first = records[0]
     steady = stationary_output(sections, first.inputs, first.output, first.used)
     return SampledModel(
         sections=sections,
         valid=valid,
         working_point=(*np.mean(first.inputs, axis=0).tolist(), steady),
-        certificate=sampled_certificate(
-            order=choice.chosen.fit.order,
-            free_order=choice.free.fit.order,
-            widened=factor,
-            valid=valid,
-            worse=choice.worse,
-            entries=entries,
-        ),
+        certificate=_certificate(choice, sections, valid, factor),
     )
 
 
@@ -324,24 +315,71 @@ def _widest(frequency: FloatArray, inside: BoolArray) -> tuple[float, float]:
     return float(frequency[starts[widest]]), float(frequency[stops[widest]])
 
 
-def _entries(
-    choice: SampledChoice, sections: ParallelSections, valid: Sequence[tuple[float, float]]
+def _certificate(
+    choice: SampledChoice,
+    sections: ParallelSections,
+    valid: Sequence[tuple[float, float]],
+    widened: float,
 ) -> dict[str, object]:
-    chosen = choice.chosen
+    """Return JSON values, ending with ``reasons``, ``warnings`` and ``verdict``.
+
+    valid: range [Hz] within the limits, for each input
+    widened: factor on the uncertainties, for the choice of the order
+    "predicted" is the share of the variance of held-out parts that free runs explain.
+    """
+    chosen, limits = choice.chosen, SAMPLED_LIMITS
     problem, residual = chosen.fit.problem, chosen.fit.residual
     variance = float(np.mean(np.concatenate([one.output for one in problem.spectra]) ** 2)) or 1.0
+    predicted, independent = 1 - float(np.mean(chosen.held_out)), _independence(chosen)
+    order, free_order = chosen.fit.order, choice.free.fit.order
+    reasons, warnings = _reasons(choice, predicted, valid), []
+    low, high = max(v[0] for v in valid), min(v[1] for v in valid)
+    accepted = Notice("estimation.accepted", low=low, high=high)
+    if not high > low:
+        accepted = Notice("estimation.accepted_apart")
+    if independent < _LEAST_INDEPENDENCE_P:
+        warnings.append(Notice("estimation.residual_follows_input", p=independent))
+    if order != free_order:
+        warnings.append(
+            Notice("estimation.order_differs", order=order, free=free_order, factor=widened)
+        )
     return {
+        "order": order,
+        "free_order": free_order,
         "delay_samples": (sections.delays / sections.period).tolist(),
         "residual_rms": float(np.sqrt(np.mean(residual**2))),
         "explained": 1 - float(np.mean(residual**2)) / variance,
-        "predicted": 1 - float(np.mean(chosen.held_out)),
+        "predicted": predicted,
         "impulse_response": choice.impulse_response,
         "whiteness_p": whiteness(residual),
-        "independence_p": _independence(chosen),
+        "independence_p": independent,
         "poles": _poles(sections, valid),
         "continuous_error": _continuous_error(sections, valid[0]),
         "samples": {"received": sum(len(r) for r in problem.records), "compared": len(residual)},
+        "limits": {
+            "gain": limits.gain,
+            "phase_rad": limits.phase,
+            "predicted_least": _LEAST_PREDICTED,
+        },
+        "warnings": [str(warning) for warning in warnings],
+        "reasons": [str(reason) for reason in reasons],
+        "verdict": REJECTED if reasons else str(accepted),
     }
+
+
+def _reasons(
+    choice: SampledChoice, predicted: float, valid: Sequence[tuple[float, float]]
+) -> list[Notice]:
+    limits, reasons = SAMPLED_LIMITS, []
+    if not predicted >= _LEAST_PREDICTED:
+        reasons.append(
+            Notice("estimation.poor_prediction", predicted=predicted, least=_LEAST_PREDICTED)
+        )
+    if choice.worse:
+        reasons.append(Notice("estimation.worse_than_impulse_response", **choice.impulse_response))
+    if not all(high > low for low, high in valid):
+        reasons.append(Notice("estimation.unknown_response", gain=limits.gain, phase=limits.phase))
+    return reasons
 
 
 def _poles(
@@ -374,56 +412,3 @@ def _continuous_error(sections: ParallelSections, valid: tuple[float, float]) ->
         ratio = equivalent.transfer_function().response(lines) / equivalent.response(lines)[0]
     error = float(np.max(np.abs(ratio - 1)))
     return error if np.isfinite(error) else None
-
-
-def sampled_certificate(
-    *,
-    order: int,
-    free_order: int,
-    widened: float,
-    valid: Sequence[tuple[float, float]],
-    worse: bool,
-    entries: Mapping[str, Any],
-) -> dict[str, object]:
-    """Return JSON values, ending with ``reasons``, ``warnings`` and ``verdict``.
-
-    order, free_order: number of poles of the model, and of the free choice
-    widened: factor on its uncertainties, for the choice of the order
-    valid: range [Hz] within the limits, for each input
-    worse: an impulse response predicts held-out samples better
-    entries: with "predicted", the share of the variance of held-out parts that free runs explain
-    """
-    predicted, limits = entries["predicted"], SAMPLED_LIMITS
-    reasons = []
-    if not predicted >= _LEAST_PREDICTED:
-        reasons.append(
-            Notice("estimation.poor_prediction", predicted=predicted, least=_LEAST_PREDICTED)
-        )
-    if worse:
-        shares = entries["impulse_response"]
-        reasons.append(Notice("estimation.worse_than_impulse_response", **shares))
-    if not all(high > low for low, high in valid):
-        reasons.append(Notice("estimation.unknown_response", gain=limits.gain, phase=limits.phase))
-    low, high = max(v[0] for v in valid), min(v[1] for v in valid)
-    accepted, warnings = Notice("estimation.accepted", low=low, high=high), []
-    if not high > low:
-        accepted = Notice("estimation.accepted_apart")
-    if (independent := entries.get("independence_p", 1.0)) < _LEAST_INDEPENDENCE_P:
-        warnings.append(Notice("estimation.residual_follows_input", p=independent))
-    if order != free_order:
-        warnings.append(
-            Notice("estimation.order_differs", order=order, free=free_order, factor=widened)
-        )
-    return {
-        "order": order,
-        "free_order": free_order,
-        **entries,
-        "limits": {
-            "gain": limits.gain,
-            "phase_rad": limits.phase,
-            "predicted_least": _LEAST_PREDICTED,
-        },
-        "warnings": [str(warning) for warning in warnings],
-        "reasons": [str(reason) for reason in reasons],
-        "verdict": REJECTED if reasons else str(accepted),
-    }
