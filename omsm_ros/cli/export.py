@@ -48,7 +48,13 @@ def export(
     """
     form = out.suffix.lower()
     if form in AS_POINTS:
-        table = _table(source, units, channel)
+        file = source / CLOUD if source.is_dir() else source
+        try:
+            cloud = CloudFile(file)
+        except FileError:
+            table = _records(read_points(file, units, channel))
+        else:
+            table = cloud.read()
         _write_points(out, form, table)
         return {"file": str(out), "points": len(table), "columns": list(table.dtype.names or ())}
     if form in AS_MAP:
@@ -59,17 +65,8 @@ def export(
     )
 
 
-def _table(source: Path, units: LengthUnits | None, channel: str | None) -> NDArray[np.void]:
-    """Return all columns of an own cloud; of another file those that every format has."""
-    file = source / CLOUD if source.is_dir() else source
-    try:
-        cloud = CloudFile(file)
-    except FileError:
-        return _records(read_points(file, units, channel))
-    return cloud.read()
-
-
 def _records(points: MeasuredPoints) -> NDArray[np.void]:
+    """Return the columns that every format has."""
     columns: dict[str, NDArray[Any]] = {"x": points.x, "y": points.y, "z": points.height}
     if points.uncertainty is not None:
         columns["uncertainty"] = points.uncertainty

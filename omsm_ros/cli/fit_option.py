@@ -48,7 +48,6 @@ def declare_fit(add: Arguments, default: tuple[str, ...] | None) -> None:
     """Add the options of a registration."""
     add("--fit", parse_dofs, default=default, metavar="PARAMETERS")
     add("--aperture", Aperture.parse, metavar="APERTURE")
-
     add("--placement", placement, metavar="M[,RAD]")
 
 

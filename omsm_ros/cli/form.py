@@ -1,7 +1,7 @@
 """Commands for the form of a part: form, compensate, surface."""
 
 import argparse
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -59,32 +59,24 @@ _TURNS, _SAMPLES_PER_TURN = 4, 2000
 _BAND = "calibrated band"
 
 
-@dataclass(frozen=True)
-class Scan:
-    """A spiral from ``radius`` [m] with ``feed`` [m] a turn at ``speed`` [rpm]."""
-
-    radius: float
-    feed: float
-    speed: float
-
-
 def show_surface(
-    surface: Surface,
-    scan: Scan,
-    limits: MachineLimits,
-    probe_angle: float | None = None,
-    out: Path | None = None,
+    scan: Spiral, limits: MachineLimits, probe_angle: float | None = None, out: Path | None = None
 ) -> dict[str, Any]:
-    """Return extent, steepest slope and limits of a surface over a disc; draw it into ``out``.
+    """Return extent, steepest slope and limits of a surface that is scanned; draw it into ``out``.
 
     probe_angle: largest angle to the normal at which the probe reads [rad]; None: unknown
 
     Raises DataError if the surface has no height somewhere on the disc.
     """
-    x, y, height, steep = _over_disc(surface, scan.radius)
+    x, y, height, steep = _over_disc(scan.surface, scan.start_radius)
     place = int(np.argmax(steep))
     angle = float(np.arctan(steep[place]))
-    evaluated, missing = speed_limits(_path(surface, scan), limits, np.inf, np.inf)
+    speed = abs(scan.spindle_speed) * RPM_HZ
+    period = max(1 / (speed * _SAMPLES_PER_TURN), SAMPLE_PERIOD.low)
+    samples = min(_TURNS * _SAMPLES_PER_TURN, int(scan.duration / period))
+    axes = scan.positions(np.arange(max(samples, 100)) * period)
+    path = ScanPath(z=axes.z, sample_period=period, x=axes.x, c=axes.c)
+    evaluated, missing = speed_limits(path, limits, np.inf, np.inf)
     evaluated = [limit for limit in evaluated if limit.name != _BAND]
     if probe_angle is None:
         missing.append("angle of the probe to the surface")
@@ -99,7 +91,7 @@ def show_surface(
         )  # fmt: skip
         save_bytes(out / FIGURE, png(made))
     return {
-        "radius": scan.radius,
+        "radius": scan.start_radius,
         "peak_to_valley": float(np.ptp(height)),
         "steepest_slope": float(steep[place]),
         "steepest_angle": angle,
@@ -130,14 +122,6 @@ def _over_disc(
     return x, y, height, np.hypot(*gradient_of(surface, x, y))
 
 
-def _path(surface: Surface, scan: Scan) -> ScanPath:
-    spiral = Spiral(surface, scan.radius, scan.feed, scan.speed)
-    period = max(1 / (abs(scan.speed) * RPM_HZ * _SAMPLES_PER_TURN), SAMPLE_PERIOD.low)
-    turns = min(_TURNS * _SAMPLES_PER_TURN, int(spiral.duration / period))
-    axes = spiral.positions(np.arange(max(turns, 100)) * period)
-    return ScanPath(z=axes.z, sample_period=period, x=axes.x, c=axes.c)
-
-
 COMPENSATION, PATH, CUT = "compensation.csv", "compensation.nc", "cut.nc"
 # Bound on the distance of the executed cut from its path [m].
 _CUT_ERROR_M = 10 * NANOMETRE_M
@@ -160,15 +144,6 @@ _SIGN = (
 )
 
 
-@dataclass(frozen=True)
-class NextCut:
-    """The next cut.  feed: a turn [m];  speed: [rpm];  tool_radius: of its nose [m]."""
-
-    feed: float
-    speed: float
-    tool_radius: float
-
-
 def compensate_form(
     measured: OpenedMeasurement,
     surface: Surface,
@@ -176,14 +151,15 @@ def compensate_form(
     low_pass: float,
     how: RegistrationOptions,
     spiral: tuple[float, int] | None = None,
-    cut: NextCut | None = None,
+    tool: tuple[float, float] | None = None,
     previous: Path | None = None,
 ) -> dict[str, Any]:
     """Write compensation.csv into ``out``: offsets to add to the height of the next cut.
 
     low_pass: cutoff, of which half is compensated [m]
     spiral: feed per turn [m] and points per turn of the next cut, for compensation.nc; None: none
-    cut: for cut.nc, a complete program;  previous: compensation.csv of the cut that made this part
+    tool: radius of its nose [m] and spindle speed [rpm], for cut.nc, a complete program on that
+        spiral;  previous: compensation.csv of the cut that made this part
 
     Raises DataError for a wavelength below the points, or if the previous cut went wrong.
     """
@@ -204,9 +180,14 @@ def compensate_form(
         along = spiral_offsets(found, *spiral)
         save_text(out / PATH, path_gcode(along))
         path = {"path": PATH, "path_places": len(along.offset), "path_left_out": along.left_out}
-    if cut is not None:
-        rim = float(np.max(np.hypot(x, y)[known]))
-        path |= _program(CutSurface(surface, found.x, found.y, total), rim, cut, out)
+    if spiral is not None and tool is not None:
+        (feed, _), (nose, speed), rim = spiral, tool, float(np.max(np.hypot(x, y)[known]))
+        cut = CutSurface(surface, found.x, found.y, total)
+        tip, duration = cut_path(cut, rim, feed, speed, nose)
+        planned = plan_path(tip, duration, _SERVO_PERIOD_S, _CUT_ERROR_M)
+        remark = f"cut at {speed:g} rpm with a nose of {nose / MILLIMETRE_M:g} mm"
+        save_text(out / CUT, program_of(planned, [remark], measures=False))
+        path |= {"cut": CUT, "path_error": planned.error, "cut_duration": duration}
     offset, spread = np.abs(found.offset[known]), found.uncertainty[known]
     sure = float(np.mean(offset > _COVERAGE * spread))
     return path | {
@@ -237,14 +218,6 @@ def _offsets(previous: Path, x: FloatArray, y: FloatArray) -> tuple[FloatArray, 
         raise FileError(f"{str(previous)!r} is no {COMPENSATION}: {err}") from err
     found = NearestNDInterpolator(table[:, :2], values)(x, y)
     return found[..., 0], found[..., 1]
-
-
-def _program(surface: Surface, rim: float, cut: NextCut, out: Path) -> dict[str, Any]:
-    path, duration = cut_path(surface, rim, cut.feed, cut.speed, cut.tool_radius)
-    planned = plan_path(path, duration, _SERVO_PERIOD_S, _CUT_ERROR_M)
-    remark = f"cut at {cut.speed:g} rpm with a nose of {cut.tool_radius / MILLIMETRE_M:g} mm"
-    save_text(out / CUT, program_of(planned, [remark], measures=False))
-    return {"cut": CUT, "path_error": planned.error, "cut_duration": duration}
 
 
 def _warnings(sure: float, before: float, after: float) -> list[str]:
@@ -359,16 +332,14 @@ def _declare_compensate(add: Arguments) -> None:
 def _compensate(args: argparse.Namespace) -> Facts:
     surface = load_surface(args.nominal, args.fit)
     spiral = (args.spiral, int(args.per_turn)) if args.spiral else None
-    cut = None
-    if args.tool_radius:
-        if not args.spiral:
-            raise ConfigurationError("--tool-radius needs the feed of the cut: give --spiral FEED")
-        cut = NextCut(args.spiral, args.rpm, args.tool_radius)
+    tool = (args.tool_radius, args.rpm) if args.tool_radius else None
+    if tool and not spiral:
+        raise ConfigurationError("--tool-radius needs the feed of the cut: give --spiral FEED")
     with result_folder(args.out, (COMPENSATION, PATH, CUT)) as out:
         points = open_measurement(args.measured, args.unit, args.channel)
         how = registration_of(args)
         facts = compensate_form(
-            points, surface, out, args.low_pass, how, spiral, cut, args.previous
+            points, surface, out, args.low_pass, how, spiral, tool, args.previous
         )
     return {**facts, "out": str(args.out)}
 
@@ -403,8 +374,8 @@ def _declare_surface(add: Arguments) -> None:
 
 
 def _surface(args: argparse.Namespace) -> Facts:
-    limits, scan = load_limits(args.limits), Scan(args.radius, args.feed, args.rpm)
-    facts = show_surface(load_surface(args.surface), scan, limits, args.probe_angle, args.out)
+    scan = Spiral(load_surface(args.surface), args.radius, args.feed, args.rpm)
+    facts = show_surface(scan, load_limits(args.limits), args.probe_angle, args.out)
     where = {"out": str(args.out)} if args.out is not None else {}
     return {"surface": str(args.surface), **facts, **where}
 

@@ -46,23 +46,23 @@ def _history(args: argparse.Namespace) -> Facts:
             f"no catalogue at {shown(address)}; check the path, or create one with --add"
         )
     added = sum(keep(address, path) for path in args.add)
-    found = history(address, args.machine)
+    machines, older = history(address, args.machine)
     if args.plot is not None:
         from omsm_ros.io.files import save_bytes
         from omsm_ros.report.campaign import draw
 
-        if len(found.machines) > _MOST_DRAWN:
+        if len(machines) > _MOST_DRAWN:
             raise ConfigurationError(
-                f"--plot of {count(len(found.machines))} machines, expected {_MOST_DRAWN} at most; "
+                f"--plot of {count(len(machines))} machines, expected {_MOST_DRAWN} at most; "
                 "choose one with --machine"
             )
-        save_bytes(args.plot, draw(found.machines))
+        save_bytes(args.plot, draw(machines))
     return {
         "catalogue": address.rpartition("@")[2],
         "added": added,
         **({"figure": str(args.plot)} if args.plot is not None else {}),
-        "older": found.older,
-        "machines": [_plain(machine) for machine in found.machines],
+        "older": older,
+        "machines": [_plain(machine) for machine in machines],
     }
 
 

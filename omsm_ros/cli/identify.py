@@ -232,13 +232,19 @@ def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:
             "--max-delay is for a held input; give --hold zero-order or first-order, or leave it "
             "out"
         )
-    if not of_table and args.hold != BAND_LIMITED and args.input != ENCODER:
+    if of_table:
+        return
+    if args.hold != BAND_LIMITED and args.input != ENCODER:
         raise ConfigurationError(
             f"--hold takes the encoder of a bag as its input, not {shown(args.input)}; leave out "
             "--input, or --hold"
         )
-    if not of_table:
-        _check_axes(args.input.split(",")[1:])
+    names = args.input.split(",")[1:]
+    if len({*names}) < len(names) or not {*names} <= {*FURTHER_AXES}:
+        raise ConfigurationError(
+            f"--input names the axes {shown(','.join(names))} besides Z, expected each of "
+            f"{', '.join(FURTHER_AXES)} once at most"
+        )
 
 
 def _check_for_bags(args: argparse.Namespace) -> None:
@@ -256,15 +262,6 @@ def _check_for_bags(args: argparse.Namespace) -> None:
         raise ConfigurationError(
             f"{' and '.join(unused)} is for a bag; a table has no counters, stamps or settings: "
             "leave it out"
-        )
-
-
-def _check_axes(names: Sequence[str]) -> None:
-    """Raise ConfigurationError for an axis that bags do not have, or that is named twice."""
-    if len({*names}) < len(names) or not {*names} <= {*FURTHER_AXES}:
-        raise ConfigurationError(
-            f"--input names the axes {shown(','.join(names))} besides Z, expected each of "
-            f"{', '.join(FURTHER_AXES)} once at most"
         )
 
 

@@ -1,15 +1,14 @@
 """Commands for recordings: record a device; inspect or repair a bag; import other recordings."""
 
 import argparse
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from omsm_ros.cli.arguments import Arguments, cell_of
 from omsm_ros.cli.command import CliCommand, Facts, say, table, warn, written
 from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
-from omsm_ros.errors import ConfigurationError, Notice
+from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import bags
 from omsm_ros.io.json_and_yaml import mapping_of
 from omsm_ros.io.tables.table import load_column_map
@@ -49,7 +48,13 @@ def inspect_bag(path: AnyBag) -> Facts:
             if topic not in watches
         ]
         vibration = _vibration(bag.vibration())
-    faults += map(str, _faults(watches))
+    for topic, watch in watches.items():
+        faults += map(str, watch.faults(relative(topic)))
+    axes, distance = watches.get(bags.AXES_TOPIC), watches.get(bags.DISTANCE_TOPIC)
+    if axes and distance and axes.samples and distance.samples:
+        period = min(axes.periods)
+        if period == min(distance.periods):
+            faults += map(str, skew_fault(counter_skew(axes, distance), period))
     rows = [_topic_facts(t, watches.get(t.role)) for t in topics]
     return {"topics": rows, "faults": faults, "vibration": vibration}
 
@@ -65,29 +70,18 @@ def _vibration(levels: Sequence[Mapping[str, Any]]) -> Facts | None:
     if not alike:
         return None
     heights = [one for one in alike if one["height"] is not None]
+
+    def largest(bands: Iterable[Sequence[float]]) -> list[float]:
+        return [float(max(band)) for band in zip(*bands, strict=True)]
+
     return {
         "spectra": len(levels),
         "alarms": sum(one["alarm"] for one in levels),
         "bands": alike[-1]["bands"],
-        "rms": {axis: _largest(one["rms"][axis] for one in alike) for axis in alike[-1]["rms"]},
-        "height": _largest(one["height"] for one in heights) if heights else None,
+        "rms": {axis: largest(one["rms"][axis] for one in alike) for axis in alike[-1]["rms"]},
+        "height": largest(one["height"] for one in heights) if heights else None,
         "height_total": max((one["height_total"] for one in heights), default=None),
     }
-
-
-def _largest(levels: Iterable[Sequence[float]]) -> list[float]:
-    """Return the largest level of each band."""
-    return [float(max(band)) for band in zip(*levels, strict=True)]
-
-
-def _faults(watches: dict[str, StreamWatch]) -> Iterator[Notice]:
-    for topic, watch in watches.items():
-        yield from watch.faults(relative(topic))
-    axes, distance = watches.get(bags.AXES_TOPIC), watches.get(bags.DISTANCE_TOPIC)
-    if axes and distance and axes.samples and distance.samples:
-        period = min(axes.periods)
-        if period == min(distance.periods):
-            yield from skew_fault(counter_skew(axes, distance), period)
 
 
 def _topic_facts(topic: bags.TopicSummary, watch: StreamWatch | None) -> Facts:
@@ -106,17 +100,13 @@ def _declare_inspect(add: Arguments) -> None:
 
 
 def _inspect(args: argparse.Namespace) -> Facts:
-    if args.repair:
-        return _repaired(args.bag)
-    return {"bag": str(args.bag), **inspect_bag(cell_of(args.bag, args))}
-
-
-def _repaired(bag: Path) -> Facts:
+    if not args.repair:
+        return {"bag": str(args.bag), **inspect_bag(cell_of(args.bag, args))}
     from omsm_ros.io.bag_repair import repair  # rarely used and slow to load
 
-    made = repair(bag)
+    made = repair(args.bag)
     return {
-        "bag": str(bag),
+        "bag": str(args.bag),
         "repaired": str(made.path),
         "messages": dict(made.messages),
         "lost": made.lost,

@@ -311,20 +311,12 @@ class MachineHistory:
     deviation: LinearTrend | None
 
 
-@dataclass(frozen=True, slots=True)
-class CatalogueHistory:
-    """Contents of a catalogue by machine.
+def history(address: str, machine: str = "") -> tuple[list[MachineHistory], int]:
+    """Return the contents of the catalogue by machine; of one machine, or of all.
 
-    older: number of calibrations and measurements that are older than those listed; zero unless a
-        table holds more than ``catalogue.MOST_ROWS``
+    Also return the number of calibrations and measurements that are older than those listed; zero
+    unless a table holds more than ``MOST_ROWS``.
     """
-
-    machines: list[MachineHistory]
-    older: int
-
-
-def history(address: str, machine: str = "") -> CatalogueHistory:
-    """Return the contents of the catalogue; of one machine, or of all."""
     older = 0
     rows: dict[str, dict[str, list[dict[str, Any]]]] = {}
     with Catalogue(address) as catalogue:
@@ -335,28 +327,21 @@ def history(address: str, machine: str = "") -> CatalogueHistory:
             for row in found:
                 name = row["machine"] or ""
                 rows.setdefault(name, {table: [] for table in _TABLES})[table].append(row)
-    return CatalogueHistory([_of(name, **rows[name]) for name in sorted(rows)], older)
-
-
-def _of(
-    name: str, calibrations: list[dict[str, Any]], measurements: list[dict[str, Any]]
-) -> MachineHistory:
-    accepted = [row for row in calibrations if row["verdict"] != "rejected"]
-    return MachineHistory(
-        name, calibrations, measurements,
-        _trend(accepted, "delay"), _trend(accepted, "static_gain"),
-        _trend(measurements, "deviation_rms"),
-    )  # fmt: skip
+    machines = []
+    for name in sorted(rows):
+        calibrations, measurements = rows[name].values()
+        accepted = [row for row in calibrations if row["verdict"] != "rejected"]
+        trends = [_trend(accepted, column) for column in ("delay", "static_gain")]
+        trends.append(_trend(measurements, "deviation_rms"))
+        machines.append(MachineHistory(name, calibrations, measurements, *trends))
+    return machines, older
 
 
 def _trend(rows: list[dict[str, Any]], name: str) -> LinearTrend | None:
-    values = np.array([np.nan if row[name] is None else row[name] for row in rows], np.float64)
-    times = np.array([_seconds(row["recorded_at"]) for row in rows], np.float64)
-    return trend(times, values)
-
-
-def _seconds(when: datetime | None) -> float:
-    return np.nan if when is None else (when - datetime(1970, 1, 1)).total_seconds()
+    when = [row["recorded_at"] for row in rows]
+    times = [np.nan if t is None else (t - datetime(1970, 1, 1)).total_seconds() for t in when]
+    values = [np.nan if row[name] is None else row[name] for row in rows]
+    return trend(np.array(times, np.float64), np.array(values, np.float64))
 
 
 def _machine(settings: Mapping[str, object]) -> str:

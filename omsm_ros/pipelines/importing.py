@@ -38,21 +38,12 @@ _ARRAYS, _TDMS = (".npy", ".npz", ".mat", ".h5", ".hdf5"), ".tdms"
 _BAGS = (".mcap", ".bag", ".db3")
 
 
-@dataclass(frozen=True, slots=True)
-class Origin:
-    """Origin of a stream's time and trigger count.
+class RowCounter:
+    """Number the rows of a stream by their triggers, else by their time, else one by one.
 
     start: instant [s, Unix] of ``epoch``, a time [s] of the recording
     zero: time [s] of the recording at trigger 0
     """
-
-    start: float = 0.0
-    epoch: float = 0.0
-    zero: float = 0.0
-
-
-class RowCounter:
-    """Number the rows of a stream by their triggers, else by their time, else one by one."""
 
     def __init__(self, stream: str, mapped: ColumnMap, timed: bool, triggered: bool) -> None:
         """timed, triggered: whether the ``stream``, a file or topic, has these columns."""
@@ -61,7 +52,7 @@ class RowCounter:
         self._mapped, self._timed, self._triggered = mapped, timed, triggered
         self._period = 0.0 if mapped.sample_period is None else mapped.sample_period
         self._last: tuple[float, int] | None = None
-        self.origin = Origin(mapped.start)
+        self.start, self.epoch, self.zero = mapped.start, 0.0, 0.0
 
     def begin(self, first: Mapping[str, FloatArray]) -> tuple[float | None, float]:
         """Determine the period from the ``first`` rows; return time of trigger 0 and period [s]."""
@@ -75,18 +66,18 @@ class RowCounter:
 
     def count(self, piece: Mapping[str, FloatArray]) -> TableRows:
         """Return the numbers and times of the next rows (column name → (n,))."""
-        times, origin = self._times(piece), self.origin
+        times = self._times(piece)
         number = -1 if self._last is None else self._last[1]
         if self._triggered:
             counter = counter_of_triggers(self._triggers(piece), number)
         elif times is not None:
-            before = self._last or (origin.zero - self._period, -1)
+            before = self._last or (self.zero - self._period, -1)
             counter = counter_of_times(times, self._period, before)
         else:
             counter = np.arange(number + 1, number + 1 + len(next(iter(piece.values()))))
-        elapsed = counter * self._period if times is None else times - origin.epoch
+        elapsed = counter * self._period if times is None else times - self.epoch
         self._last = (0.0 if times is None else float(times[-1]), int(counter[-1]))
-        return TableRows(counter, elapsed, self._period, origin.start)
+        return TableRows(counter, elapsed, self._period, self.start)
 
     def _times(self, piece: Mapping[str, FloatArray]) -> FloatArray | None:
         if not self._timed:
@@ -157,7 +148,14 @@ def _write_bag(sources: Sequence[_Source], mapped: ColumnMap, out: Path) -> None
             bag.write_block(block)
             done += len(block)
             state_progress(done, 0)
-        _check_counted(streams)
+        gaps = [s for s in streams if any(source.found.missing for source in s.sources)]
+        uncounted = [s for s in streams if not s.counted]
+        if gaps and uncounted:
+            raise FileError(
+                f"triggers are missing in {gaps[0].sources[0].found.file}, and "
+                f"{uncounted[0].sources[0].found.file} has neither trigger nor time to assign its "
+                "rows by; add one of these columns"
+            )
 
 
 def _check_streams(
@@ -175,18 +173,6 @@ def _check_streams(
                 f"files with different columns have the column {name!r} of {channel}; import them "
                 "one by one, or leave out those that repeat it"
             )
-
-
-def _check_counted(streams: Sequence[_Stream]) -> None:
-    """Raise FileError if triggers are missing in one stream and another has no count."""
-    gaps = [s for s in streams if any(source.found.missing for source in s.sources)]
-    uncounted = [s for s in streams if not s.counted]
-    if gaps and uncounted:
-        raise FileError(
-            f"triggers are missing in {gaps[0].sources[0].found.file}, and "
-            f"{uncounted[0].sources[0].found.file} has neither trigger nor time to assign its rows "
-            "by; add one of these columns"
-        )
 
 
 class _Stream:
@@ -219,7 +205,8 @@ def _align(streams: Sequence[_Stream], mapped: ColumnMap) -> None:
     together = counted or share_trigger(begun, [s.period for s in streams])
     for stream in streams:
         own = stream.begins is not None and not together
-        stream.counter.origin = Origin(start, epoch, stream.begins if own else epoch)
+        stream.counter.start, stream.counter.epoch = start, epoch
+        stream.counter.zero = stream.begins if own else epoch
         for source in stream.sources:
             source.found.own_clock = own
 
@@ -240,8 +227,22 @@ class _Source:
             name = mapped.columns[lacking[0]].name
             raise FileError(f"{self.without(name, lacking[0])}; give all axes in one file")
         table.used(mapped.names(self.channels))
-        self._check_units()
-        self._check_period()
+        for channel in self.channels:
+            column = mapped.columns[channel]
+            stated = stated_unit(table, column.name)
+            if column.contradicts(stated, channel):
+                raise FileError(
+                    f"{table} has {column.name!r} in {stated}, the map in {column.unit}; "
+                    f"correct the map, or, if the file is wrong, write unit: count and count: what "
+                    "one is in SI"
+                )
+        period = mapped.sample_period
+        stated = table.sample_period
+        if stated and period and abs(period / stated - 1) > MOST_PERIOD_ERROR:
+            raise FileError(
+                f"{table} states a sample period of {stated:g} s, the map {period:g} s; "
+                "correct the map"
+            )
 
     def without(self, name: str, channel: str) -> str:
         """Return why the column ``name`` of ``channel`` is not available here."""
@@ -254,26 +255,6 @@ class _Source:
             f"{self._table} has no column {name!r} of {channel}, but {shown(self._table.names)}; "
             "name it as the file does"
         )
-
-    def _check_period(self) -> None:
-        stated, mapped = self._table.sample_period, self._mapped.sample_period
-        if stated and mapped and abs(mapped / stated - 1) > MOST_PERIOD_ERROR:
-            raise FileError(
-                f"{self._table} states a sample period of {stated:g} s, the map {mapped:g} s; "
-                "correct the map"
-            )
-
-    def _check_units(self) -> None:
-        """Raise FileError if the map contradicts a unit that the file states."""
-        for channel in self.channels:
-            column = self._mapped.columns[channel]
-            stated = stated_unit(self._table, column.name)
-            if column.contradicts(stated, channel):
-                raise FileError(
-                    f"{self._table} has {column.name!r} in {stated}, the map in {column.unit}; "
-                    f"correct the map, or, if the file is wrong, write unit: count and count: what "
-                    "one is in SI"
-                )
 
     def first(self) -> Mapping[str, FloatArray]:
         """Return the first rows; FileError if there are none."""
@@ -293,23 +274,15 @@ class _Source:
             found.missing += int(np.sum(skipped))
             found.rows += len(rows.counter)
             found.sample_period = rows.period
-            yield from self._made(piece, rows)
-        found.repeated_names = self._table.repeated_names
-        found.passed_over = self._table.passed_over
-
-    def _made(
-        self, piece: Mapping[str, FloatArray], rows: TableRows
-    ) -> Iterator[AxisBlock | DistanceBlock]:
-        found = self.found
-        if found.axes:
-            for block in axis_blocks(piece, self._mapped, rows):
+            for block in axis_blocks(piece, self._mapped, rows) if found.axes else ():
                 finite = [np.isfinite(v) for v in (block.x, block.y, block.z, block.b, block.c)]
                 found.lost += int(np.sum(~np.all(finite, axis=0)))
                 yield block
-        if found.distance:
-            for reading in distance_blocks(piece, self._mapped, rows):
+            for reading in distance_blocks(piece, self._mapped, rows) if found.distance else ():
                 found.invalid += int(np.sum(~reading.ok))
                 yield reading
+        found.repeated_names = self._table.repeated_names
+        found.passed_over = self._table.passed_over
 
     def _pieces(self) -> Iterator[dict[str, FloatArray]]:
         names = list(dict.fromkeys(self._mapped.names(self.channels)))

@@ -35,7 +35,6 @@ from omsm_ros.core.correction.systematic import resolves_per_turn_waves, scan_fi
 from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.lti.discretisation import discretisation_error, discretise
-from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.aperture import Aperture, within_aperture
 from omsm_ros.core.surface.deviation import mismatch
 from omsm_ros.core.surface.posed import Pose, PosedSurface
@@ -217,21 +216,18 @@ def live_verdict(
     shared = [size for name, size in corrector.budget.items() if name not in RANDOM]
     expanded = 2 * sum(size**2 for size in shared) ** 0.5
     noise = excess_noise(corrector.budget)
-    doubts = [*([str(noise)] if noise else []), *_without_slopes(corrector, stated)]
-    verdict = untested_verdict(expanded, accuracy, calibration)
-    return verdict_entry(verdict, doubts=doubts) | {"uncertainty": expanded}
-
-
-def _without_slopes(corrector: Corrector, stated: MachineSources) -> Iterator[str]:
+    doubts = [str(noise)] if noise else []
     lateral = {
         s.name for s in stated.scan_sources() if s.kind.needs_slope and s.standard_uncertainty
     }
     missing = sorted(lateral - set(corrector.budget))
     if missing and corrector.trace.seen:
-        yield (
+        doubts.append(
             f"{', '.join(missing)} not in the uncertainty of the points: slopes are unknown; give "
             "the corrector the part's surface (parameter 'nominal')"
         )
+    verdict = untested_verdict(expanded, accuracy, calibration)
+    return verdict_entry(verdict, doubts=doubts) | {"uncertainty": expanded}
 
 
 def _losses(done: Correction) -> Iterator[str | Notice]:
@@ -351,11 +347,13 @@ def summarise(
         },
         "files": {"cloud": CLOUD, "summary": SUMMARY},
         "admission": done.admission,
-        "warnings": [
-            *(f"overridden: {reason}" for reason in done.reasons),
-            *_implausible(done.temperatures),
-        ],
+        "warnings": [*(f"overridden: {reason}" for reason in done.reasons)],
     }
+    if lost := int(np.sum(~np.isfinite(done.temperatures))):
+        summary["warnings"].append(
+            f"{lost} of {len(done.temperatures)} temperatures are implausible, expected "
+            f"{TEMPERATURE.range_text}; {TEMPERATURE.remedy}"
+        )
     if not done.statistics:
         summary["warnings"] += [*done.faults, "no sample could be corrected; see the account"]
         return summary
@@ -385,15 +383,6 @@ def conditions(done: Correction, calibration: Calibration) -> dict[str, Any]:
             "change": float(valid_temperatures[-1] - valid_temperatures[0]),
         },
     }
-
-
-def _implausible(temperatures: FloatArray) -> list[str]:
-    lost = int(np.sum(~np.isfinite(temperatures)))
-    said = (
-        f"{lost} of {len(temperatures)} temperatures are implausible, expected "
-        f"{TEMPERATURE.range_text}; {TEMPERATURE.remedy}"
-    )
-    return [said] * bool(lost)
 
 
 def _motion_judged(done: Correction, calibration: Calibration) -> dict[str, Any]:

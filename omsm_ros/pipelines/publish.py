@@ -171,22 +171,15 @@ def report_again(result: Path, calibration: Calibration, nominal: Surface | None
             f"{str(result)!r} was corrected with a nominal surface; give the same one (--nominal)"
         )
     cloud = CloudFile(result / CLOUD).read(MOST_DRAWN)
-    if nominal is not None and "deviation" in summary:
-        _check_nominal(cloud, nominal, summary["deviation"]["corrected"]["rms"])
+    if nominal is not None and "deviation" in summary and len(cloud):
+        x, y, height = (cloud[name].astype(np.float64) for name in ("x", "y", "height"))
+        found = RunningStatistics()
+        found.add(x, y, deviation(x, y, height, nominal))
+        here, rms = found.statistics().rms, summary["deviation"]["corrected"]["rms"]
+        if abs(here - rms) > _SAME_RMS * max(here, rms):
+            raise ConfigurationError(
+                f"the cloud deviates by {quantity(here, 'm')} rms from this nominal surface, and "
+                f"by {quantity(rms, 'm')} from that of the correction; give the same surface"
+            )
     publish_scan(result, summary, calibration, nominal, cloud)
     return result / REPORT
-
-
-def _check_nominal(cloud: NDArray[np.void], nominal: Surface, rms: float) -> None:
-    """Raise ConfigurationError unless the cloud deviates from ``nominal`` by ``rms`` [m]."""
-    if not len(cloud):
-        return
-    x, y, height = (cloud[name].astype(np.float64) for name in ("x", "y", "height"))
-    found = RunningStatistics()
-    found.add(x, y, deviation(x, y, height, nominal))
-    here = found.statistics().rms
-    if abs(here - rms) > _SAME_RMS * max(here, rms):
-        raise ConfigurationError(
-            f"the cloud deviates by {quantity(here, 'm')} rms from this nominal surface, and by "
-            f"{quantity(rms, 'm')} from that of the correction; give the same surface"
-        )

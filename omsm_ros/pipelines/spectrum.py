@@ -185,18 +185,16 @@ def cleaned_points(scan: SpectrumOfScan) -> SurfacePoints:
     return replace(scan.read.points, height=scan.read.points.height - scan.removed)
 
 
-def exposure_of(scans: Sequence[SpectrumOfScan], options: SpectrumOptions) -> Exposure | None:
-    """Return the exposure of the probe, declared or from the amplitudes of the scans."""
-    if options.exposure is not None:
-        return declared_exposure(options.exposure)
-    textures = passing_textures([(scan.studied, scan.named) for scan in scans])
-    return estimate_exposure(textures, max(scan.studied.signal.period for scan in scans))
-
-
 def summary_of(scans: Sequence[SpectrumOfScan], options: SpectrumOptions) -> dict[str, Any]:
     """Return the content of ``spectrum.json``, in SI units."""
     rows = [row for scan in scans for row in scan.named]
-    calibration, exposure = options.calibration, exposure_of(scans, options)
+    calibration = options.calibration
+    if options.exposure is None:
+        textures = passing_textures([(scan.studied, scan.named) for scan in scans])
+        longest = max(scan.studied.signal.period for scan in scans)
+        exposure = estimate_exposure(textures, longest)
+    else:
+        exposure = declared_exposure(options.exposure)
     return {
         "schema": SCHEMA,
         "normalisation": NORMALISATION,
@@ -264,14 +262,11 @@ def _motion_facts(motion: Density, calibration: Calibration | None) -> dict[str,
     """Return rms of the motion in all, and of its content above the calibrated band [m]."""
     top = float(motion.frequency[-1])
     total = motion.power(0.0, top)
-    if calibration is None:
-        return {"rms": total**0.5, "valid_up_to": None, "outside_band_rms": None}
-    beyond = motion.power(calibration.valid_up_to, top) if calibration.valid_up_to < top else 0.0
-    return {
-        "rms": total**0.5,
-        "valid_up_to": calibration.valid_up_to,
-        "outside_band_rms": beyond**0.5,
-    }
+    known, beyond = None, None
+    if calibration is not None:
+        known = calibration.valid_up_to
+        beyond = motion.power(known, top) ** 0.5 if known < top else 0.0
+    return {"rms": total**0.5, "valid_up_to": known, "outside_band_rms": beyond}
 
 
 def _peak_facts(studied: StudiedScan, row: NamedLine) -> dict[str, Any]:
@@ -350,7 +345,9 @@ def publish_spectra(
     kind = "band_stopped" if options.stop else "vibration_removed"
     clouds = [f"{kind}_{k + 1}.ply" for k in range(len(paths))]
     densities = [n.format(k + 1) for k in range(len(paths)) for _, n, _ in _DENSITIES]
-    owned = (*clouds, *densities, *_files_before(out), REPORT, SPECTRUM)
+    kinds = ("band_stopped_*.ply", "vibration_removed_*.ply", "density_*.csv")
+    earlier = [path.name for one in kinds for path in out.glob(one) if (out / SPECTRUM).is_file()]
+    owned = (*clouds, *densities, *earlier, REPORT, SPECTRUM)
     with result_folder(out, owned) as folder:
         scans = spectra_of(paths, options)
         summary = summary_of(scans, options)
@@ -386,9 +383,3 @@ _DENSITIES = (
     (TIME, "density_{}.csv", ("frequency_Hz", "density_m2_per_Hz")),
     (PATH, "density_path_{}.csv", ("frequency_per_m", "density_m3")),
 )
-
-
-def _files_before(out: Path) -> list[str]:
-    kinds = ("band_stopped_*.ply", "vibration_removed_*.ply", "density_*.csv")
-    is_result = (out / SPECTRUM).is_file()
-    return [path.name for kind in kinds for path in out.glob(kind) if is_result]

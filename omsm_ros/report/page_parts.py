@@ -3,7 +3,7 @@
 import re
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jinja2
 
@@ -81,11 +81,10 @@ class Section:
 def present(sections: Sequence[Section], figures: Mapping[str, bytes]) -> list[Section]:
     """Return ``sections`` with available figures and non-empty tables, without empty sections."""
     cut = [
-        Section(
-            section.title,
-            tuple(name for name in section.figures if name in figures),
-            tuple(table for table in section.tables if table.rows),
-            section.note,
+        replace(
+            section,
+            figures=tuple(name for name in section.figures if name in figures),
+            tables=tuple(table for table in section.tables if table.rows),
         )
         for section in sections
     ]

@@ -115,15 +115,15 @@ def calibration_table(calibration: Calibration) -> Table:
         ("low-frequency delay", delay),
         ("latency of the probe in it", latency_text(calibration)),
         ("sample period", quantity(calibration.sample_period, "s")),
+        ("id", calibration.id[:16]),
     ]
-    rows.append(("id", calibration.id[:16]))
     return Table("Calibration", (), [row for row in rows if row[1] != NOTHING])
 
 
 def mapping_table(title: str, values: Mapping[str, object]) -> Table:
     """Return a mapping of JSON values, one row per key."""
-    return Table(title, (), [(str(key), _json_text(value)) for key, value in values.items()])
-
-
-def _json_text(value: object) -> str:
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
+    rows = [
+        (str(k), v if isinstance(v, str) else json.dumps(v, ensure_ascii=False, default=str))
+        for k, v in values.items()
+    ]
+    return Table(title, (), rows)

@@ -56,7 +56,7 @@ def test_repeated_statements_are_listed_once(tmp_path, address, true_calibration
     assert keep(address, folder)
     assert not keep(address, path)
     assert not keep(address, folder)
-    (twin, lathe) = sorted(history(address).machines, key=lambda m: len(m.measurements))
+    (twin, lathe) = sorted(history(address)[0], key=lambda m: len(m.measurements))
     assert [row["id"] for row in twin.calibrations] == [true_calibration.id]
     assert lathe.machine == "lathe 1"
     (row,) = lathe.measurements
@@ -66,7 +66,7 @@ def test_repeated_statements_are_listed_once(tmp_path, address, true_calibration
 
 def test_a_row_holds_what_its_calibration_says(tmp_path, address, true_calibration):
     keep_calibration(address, true_calibration, tmp_path / "cal.json")
-    (machine,) = history(address).machines
+    (machine,) = history(address)[0]
     (row,) = machine.calibrations
     assert row["delay"] == pytest.approx(true_calibration.dynamics.low_frequency_delay)
     assert row["static_gain"] == true_calibration.static_gain
@@ -90,14 +90,14 @@ def test_drift_of_a_machine_is_found_over_days(
         bag = _bag(tmp_path / f"{day}.mcap", day, block)
         calibration = aged(true_calibration, 1e-6 * day)
         keep_calibration(address, calibration, tmp_path / f"{day}.json", bag)
-    (machine,) = history(address, "lathe 1").machines
+    (machine,) = history(address, "lathe 1")[0]
     assert [row["recorded_at"] for row in machine.calibrations] == [
         datetime(2026, 1, day + 1) for day in range(8)
     ]
     assert machine.delay.slope * 86_400 == pytest.approx(1e-6, rel=1e-6)
     assert machine.delay.significant
     assert machine.deviation is None
-    assert history(address, "lathe 2").machines == []
+    assert history(address, "lathe 2")[0] == []
 
 
 def test_a_clock_that_was_never_set_tells_no_time(tmp_path, small_scan_blocks):
@@ -126,7 +126,7 @@ def test_two_writers_at_once_lose_nothing(tmp_path, address):
         for writer in "ab"
     ]
     assert [writer.wait() for writer in writers] == [0, 0]
-    (machine,) = history(address).machines
+    (machine,) = history(address)[0]
     assert len({row["folder"] for row in machine.measurements}) == 20
 
 

@@ -219,10 +219,27 @@ def surface_figures(cloud: CloudView, nominal: Surface | None) -> dict[str, byte
     trace = dynamic_error(cloud.time, cloud.dynamic_error, uncertainty=cloud.uncertainty)
     made = {"dynamic_error": style.png(trace)}
     if nominal is None:
-        return {**made, **_height_maps(cloud)}
-    corrected, raw = levelled(cloud, nominal)
-    deviations = {"raw": raw, "corrected": corrected}
-    return {**made, **_maps(cloud, deviations), **_profiles(cloud, deviations)}
+        height, error = cloud.height - cloud.height.min(), cloud.dynamic_error
+        ends, above = (0.0, float(height.max()) or 1.0), "above the lowest point"
+        maps: dict[str, tuple[Any, ...]] = {
+            "height_map": (height, "µm", "Height", ends, above),
+            "error_map": (error, "µm", "Dynamic error", None, "dynamic error"),
+        }
+    else:
+        corrected, raw = levelled(cloud, nominal)
+        made |= _profiles(cloud, {"raw": raw, "corrected": corrected})
+        limits = symmetric_limits(cloud.x, cloud.y, raw)
+        unit = unit_for(limits[1])
+        maps = {
+            "raw_map": (raw, unit, "Uncorrected", limits, "deviation"),
+            "corrected_map_same_scale":
+                (corrected, unit, "Corrected, same scale", limits, "deviation"),
+            "corrected_map": (corrected, "nm", "Corrected, enlarged", None, "deviation"),
+        }  # fmt: skip
+    for name, (values, unit, title, ends, quantity) in maps.items():
+        look = {"unit": unit, "title": f"{title} [{unit}]", "limits": ends, "quantity": quantity}
+        made[name] = style.png(deviation_map(cloud.x, cloud.y, values, **look))
+    return made
 
 
 def levelled(
@@ -238,35 +255,6 @@ def levelled(
     corrected = form.level(x, y, away, tilt=tilt, weights=cloud.area)
     raw = form.level(x, y, corrected + cloud.dynamic_error, weights=cloud.area)
     return corrected, raw
-
-
-def _height_maps(cloud: CloudView) -> dict[str, bytes]:
-    height = cloud.height - cloud.height.min()
-    look: dict[str, Any] = {"limits": (0.0, float(height.max()) or 1.0)}
-    above = "above the lowest point"
-    shown = {
-        "height_map": (height, "Height [µm]", {**look, "quantity": above}),
-        "error_map": (cloud.dynamic_error, "Dynamic error [µm]", {"quantity": "dynamic error"}),
-    }
-    return {
-        name: style.png(deviation_map(cloud.x, cloud.y, v, unit="µm", title=title, **more))
-        for name, (v, title, more) in shown.items()
-    }
-
-
-def _maps(cloud: CloudView, deviations: dict[str, FloatArray]) -> dict[str, bytes]:
-    raw, corrected = deviations["raw"], deviations["corrected"]
-    limits = symmetric_limits(cloud.x, cloud.y, raw)
-    unit = unit_for(limits[1])
-    shown = {
-        "raw_map": (raw, unit, f"Uncorrected [{unit}]", limits),
-        "corrected_map_same_scale": (corrected, unit, f"Corrected, same scale [{unit}]", limits),
-        "corrected_map": (corrected, "nm", "Corrected, enlarged [nm]", None),
-    }
-    return {
-        name: style.png(deviation_map(cloud.x, cloud.y, v, unit=unit, title=title, limits=ends))
-        for name, (v, unit, title, ends) in shown.items()
-    }
 
 
 _ANGLES = {"profile_x": 0.0, "profile_y": np.pi / 2, "profile_diagonal": np.pi / 4}

@@ -226,8 +226,6 @@ PROFILES = {
     "profile_diagonal": "A lag's error is largest here if the part is tilted along x.",
     "profile_radius": "Mean of each ring: rotationally symmetric error.",
 }
-ERRORS = {"dynamic_error": "Before and after: mind the different scales."}
-DYNAMICS = {"bode": "Grey: above the frequency up to which the calibration is valid."}
 FORM = {
     "form_map": "Pose removed. ×: left out as dust. Hatched: aperture without points.",
     "form_lines": "Along the normal, pose removed, mean over 1/50 of the radius; k = 2.",
@@ -237,7 +235,16 @@ FORM = {
     "psd_direction": "Over the direction of the waves; half a turn is the mean square.",
     "psd_areal": "Its sum times the area of a block is the mean square.",
 }
-CAPTIONS = {**MAPS, **PROFILES, **FORM, **ERRORS, **DYNAMICS}
+GROUPS = {
+    "Surface": MAPS,
+    "Profiles": PROFILES,
+    "Form of the registered part": FORM,
+    "Dynamic error": {"dynamic_error": "Before and after: mind the different scales."},
+    "Dynamics of the probe": {
+        "bode": "Grey: above the frequency up to which the calibration is valid."
+    },
+}
+CAPTIONS = {name: text for group in GROUPS.values() for name, text in group.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,7 +289,11 @@ def render(report: Report) -> str:
         script=drawing,
         script_policy=policy_of(drawing),
         headlines=headlines(report.summary),
-        sections=_sections(report),
+        sections=[
+            (title, names)
+            for title, group in GROUPS.items()
+            if (names := [name for name in group if name in report.figures])
+        ],
         records=_records(report),
         picture=lambda name: picture(report.figures[name]),
         caption=CAPTIONS.__getitem__,
@@ -295,7 +306,12 @@ def headlines(summary: Mapping[str, Any]) -> list[Headline]:
     found = []
     before = part(summary, "dynamic_error_before")
     if before:
-        found.append(_dynamic_headline(before, part(summary, "dynamic_error_after")))
+        after = part(summary, "dynamic_error_after")
+        sides = [before, after] if after else [before]
+        value, extent = (" → ".join(quantity(s[k], "m") for s in sides)
+                         for k in ("rms", "peak_to_valley"))  # fmt: skip
+        name = "Dynamic error, rms" if after else "Dynamic error removed, rms"
+        found.append(Headline(name, value, f"peak to valley {extent}"))
     median = part(summary, "uncertainty", "median")
     if median is not None:
         most = quantity(2 * part(summary, "uncertainty", "largest"), "m")
@@ -306,30 +322,6 @@ def headlines(summary: Mapping[str, Any]) -> list[Headline]:
         text = f"of {tables.count(stream['received'])} samples received"
         found.append(Headline("Surface points", tables.count(stream["corrected"]), text))
     return found
-
-
-def _dynamic_headline(before: Mapping[str, Any], after: Mapping[str, Any] | None) -> Headline:
-    value = quantity(before["rms"], "m")
-    detail = f"peak to valley {quantity(before['peak_to_valley'], 'm')}"
-    if not after:
-        return Headline("Dynamic error removed, rms", value, detail)
-    return Headline(
-        "Dynamic error, rms",
-        f"{value} → {quantity(after['rms'], 'm')}",
-        f"{detail} → {quantity(after['peak_to_valley'], 'm')}",
-    )
-
-
-def _sections(report: Report) -> list[tuple[str, list[str]]]:
-    groups = {
-        "Surface": MAPS,
-        "Profiles": PROFILES,
-        "Form of the registered part": FORM,
-        "Dynamic error": ERRORS,
-        "Dynamics of the probe": DYNAMICS,
-    }
-    present = {title: [n for n in names if n in report.figures] for title, names in groups.items()}
-    return [(title, names) for title, names in present.items() if names]
 
 
 def _records(report: Report) -> list[tables.Table]:

@@ -15,7 +15,7 @@ from omsm_ros.core.streams.imported_columns import Column, ColumnMap
 from omsm_ros.errors import DataError, FileError
 from omsm_ros.io import bags
 from omsm_ros.io.tables.table import load_column_map
-from omsm_ros.pipelines.importing import Origin, RowCounter, import_recording
+from omsm_ros.pipelines.importing import RowCounter, import_recording
 from omsm_ros.pipelines.recording import Recording
 
 METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "inch": 0.0254}
@@ -158,7 +158,7 @@ def test_rows_are_counted_alike_however_a_file_is_read_in_pieces(
         assert period == pytest.approx(1e-3)
         if timed:
             assert zero == pytest.approx(5.0)
-            rows.origin = Origin(100.0, zero, zero)
+            rows.start, rows.epoch, rows.zero = 100.0, zero, zero
         parts = [rows.count(piece) for piece in pieces]
         found.append((np.concatenate([p.counter for p in parts]),
                       np.concatenate([p.elapsed for p in parts])))  # fmt: skip
