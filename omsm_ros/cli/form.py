@@ -277,7 +277,7 @@ def _form(args: argparse.Namespace) -> Facts:
             # Imported on demand, because it takes longer to load than many forms to evaluate.
             from omsm_ros.pipelines.publish import publish_form
 
-            publish_form(source, out, args.origin)
+            publish_form(source, out, args.measured.resolve().name, args.origin)
             facts = {**facts, "report": REPORT}
     return {**facts, "out": str(args.out)}
 

@@ -8,6 +8,7 @@ from omsm_ros.cli.arguments import Arguments, cell_of
 from omsm_ros.cli.command import CliCommand, Facts, table, written
 from omsm_ros.core.adjustment.source_evaluation import (
     KINDS,
+    SPHERE,
     FoundSource,
     evaluate_sources,
     sources_of_alignment,
@@ -24,7 +25,6 @@ from omsm_ros.pipelines.study_scans import alignment_of
 from omsm_ros.quantities import RADIUS
 from omsm_ros.readable import date_text_of_stamp, now_text, standard
 
-_SPHERE = "sphere"
 _HOW = """\
 still: probe before a fixed place for a minute: noise, drift
 passes: X over the same line ten times, spindle stopped: drift
@@ -35,7 +35,7 @@ sphere: spiral over a sphere (--radius) mounted a millimetre off the axis: centr
 
 
 def _declare(add: Arguments) -> None:
-    add("kind", str, "kind of the recording, see below", choices=(*KINDS, _SPHERE))
+    add("kind", str, "kind of the recording, see below", choices=(*KINDS, SPHERE))
     add.bags("bag")
     add("--calibration", "CAL.json", required=True)
     add("--out", "SOURCES.yaml", "file to which the sources are added", required=True)
@@ -52,7 +52,7 @@ def _sources(args: argparse.Namespace) -> Facts:
     bag = cell_of(args.bag, args)
     options = CorrectionOptions(polarity=args.polarity, geometry=geometry)
     scan = read_scan(bag, calibration, options)
-    if args.kind == _SPHERE:
+    if args.kind == SPHERE:
         if args.radius is None:
             raise ConfigurationError("a sphere needs its radius; give --radius")
         aligned, _ = alignment_of(bag, calibration, args.radius, geometry)

@@ -4,10 +4,11 @@ import argparse
 
 from omsm_ros.cli.arguments import Arguments
 from omsm_ros.cli.command import CliCommand, Facts, say, say_lines
+from omsm_ros.core.adjustment.source_evaluation import PASSES, SPHERE, STAND_OFFS, STILL, TURNED
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.pipelines.record_bags import record_sources, record_twin
 from omsm_ros.quantities import FEED, RADIUS, SEED, SPEED
-from omsm_ros.twin.scenario import PASSES, SPHERE, STAND_OFFS, STILL, TURNED, Scenario
+from omsm_ros.twin.scenario import Scenario
 
 
 def _declare_twin(add: Arguments) -> None:

@@ -238,7 +238,7 @@ def perform(
     if plan.view:
         with stage("look at http://127.0.0.1:8080/ while it scans"):
             pass
-    steps = plan.step_test_samples
+    steps, first, second = plan.samples()
     with stage(f"step test: {steps} samples on a fixed mirror", steps) as progress:
         node.call(Trigger, "/omsm/cell_emulator/step_test", Trigger.Request())
         _follow(node, "calibrator", {"axes_held": 0, "distance_held": 0}, steps, progress)
@@ -250,14 +250,13 @@ def perform(
         )
     with stage("starting the recorder"):
         _record(node, processes, plan, plan.bag)
-    with stage(f"scanning the mirror: {plan.scan_samples} points", plan.scan_samples) as progress:
-        _scan(node, plan, "scan", plan.scan_samples, progress)
+    with stage(f"scanning the mirror: {first} points", first) as progress:
+        _scan(node, plan, "scan", first, progress)
     with stage("starting the recorder of the second scan"):
         processes.end("recorder")
         _record(node, processes, plan, plan.second_bag)
-    samples = plan.second_scan_samples
-    with stage(f"outward at twice the speed: {samples} points", samples) as progress:
-        _scan(node, plan, "verifying_scan", samples, progress)
+    with stage(f"outward at twice the speed: {second} points", second) as progress:
+        _scan(node, plan, "verifying_scan", second, progress)
     if plan.view:
         node.show("both scans are recorded and are being adjusted together")
     with stage("ending the nodes"):

@@ -23,7 +23,6 @@ from omsm_ros.core.adjustment import (
     adjust,
 )
 from omsm_ros.core.adjustment.adjust import corrected_heights
-from omsm_ros.core.adjustment.figures import Contribution
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import (
@@ -320,19 +319,19 @@ def conformity_entry(
 def figures_entry(form: FormMap) -> dict[str, Any]:
     """Return PV, rms and Zernike terms of the form with their uncertainties, lengths in metres."""
     spread = np.sqrt(np.maximum(np.diag(form.term_covariance), 0.0))
+
+    def figure(value: float, uncertainty: float) -> dict[str, float]:
+        return {"value": float(value), "standard_uncertainty": float(uncertainty)}
+
     return {
-        "peak_to_valley": _figure(form.pv.value, form.pv.uncertainty),
-        "rms": _figure(form.rms.value, form.rms.uncertainty),
+        "peak_to_valley": figure(form.pv.value, form.pv.uncertainty),
+        "rms": figure(form.rms.value, form.rms.uncertainty),
         "removed": list(form.removed),
         "terms": [
-            {"n": t.n, "m": t.m, **_figure(value, size)}
+            {"n": t.n, "m": t.m, **figure(value, size)}
             for t, value, size in zip(form.terms, form.coefficients, spread, strict=True)
         ],
     }
-
-
-def _figure(value: float, uncertainty: float) -> dict[str, float]:
-    return {"value": float(value), "standard_uncertainty": float(uncertainty)}
 
 
 def _source_entry(source: SourceFinding) -> dict[str, Any]:
@@ -438,8 +437,15 @@ def _values(reason: Reason) -> Mapping[str, Any]:
     joined = (", " if reason.code in _OPEN else " or ").join(texts)
     possible = ", ".join(dict.fromkeys(filter(None, known)))
     declare = sentence("verdict.declare", {"names": possible}) if possible else ""
+    contribution = ""
+    if (largest := reason.largest) is not None:
+        code = "verdict.remain" if math.isnan(largest.allowed) else "verdict.shrink"
+        size, allowed = (sized(v, largest.unit, 2) for v in (largest.size, largest.allowed))
+        name = f"{source_name(largest.name)} ({largest.name})"
+        parts = {"name": name, "size": size, "allowed": allowed, "rest": largest.rest}
+        contribution = sentence(code, parts)
     return {"names": joined, "value": reason.value, "limit": reason.limit, "remedy": remedy,
-            "declare": declare, "contribution": _contribution_text(reason.largest)}  # fmt: skip
+            "declare": declare, "contribution": contribution}  # fmt: skip
 
 
 def _in_file(family: str) -> str:
@@ -447,12 +453,3 @@ def _in_file(family: str) -> str:
     name = family.split("@")[0].split("/")[0]
     name = _DECLARED_AS.get(name, name)
     return name if name in NAMES else ""
-
-
-def _contribution_text(largest: Contribution | None) -> str:
-    if largest is None:
-        return ""
-    code = "verdict.remain" if math.isnan(largest.allowed) else "verdict.shrink"
-    size, allowed = (sized(v, largest.unit, 2) for v in (largest.size, largest.allowed))
-    name = f"{source_name(largest.name)} ({largest.name})"
-    return sentence(code, {"name": name, "size": size, "allowed": allowed, "rest": largest.rest})

@@ -23,7 +23,7 @@ from omsm_ros.core.correction.systematic import (
     scan_fields,
 )
 from omsm_ros.core.correction.uncertainty import with_lateral_uncertainty
-from omsm_ros.core.kinematics.kinematics import PitchCurve, Surface
+from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.kinematics.scan_path import ScanPath, ScanPathReader
 from omsm_ros.core.streams.axes_at_probe import axes_at_probe
 from omsm_ros.core.streams.blocks import (
@@ -139,7 +139,19 @@ class CorrectedScan:
                 self.corrector.push_distance(block)
             yield block, self.corrector.take()
         yield None, self.corrector.finish()
-        self._check_complete()
+        account = self.account
+        name = RejectionReason.OVERDUE.name.lower()
+        lost = min(s.counted.get(name, 0) for s in (account.axes, account.distance))
+        if lost:
+            raise BagError(
+                f"{str(self.path)!r}: {lost} samples were dropped before their partners came: one "
+                f"stream was recorded more than {MAX_PENDING_SAMPLES} samples ahead of the other; "
+                "record both at the same time"
+            )
+        received = (account.axes.received, account.distance.received)
+        for topic, samples in zip(SCAN_TOPICS, received, strict=True):
+            if not samples:
+                raise BagError(f"{str(self.path)!r} has no samples on {topic!r}; record a scan")
 
     def read(self) -> tuple[list[AxisBlock], list[SurfacePoints]]:
         """Return all blocks of the axes and all points; BagError as :meth:`steps`."""
@@ -161,21 +173,6 @@ class CorrectedScan:
                 f"{counts_text(distance.counted)}, of {axes.received} axis samples "
                 f"{counts_text(axes.counted)}; check the bag with 'omsm inspect'"
             )
-
-    def _check_complete(self) -> None:
-        name = RejectionReason.OVERDUE.name.lower()
-        account = self.account
-        lost = min(s.counted.get(name, 0) for s in (account.axes, account.distance))
-        if lost:
-            raise BagError(
-                f"{str(self.path)!r}: {lost} samples were dropped before their partners came: one "
-                f"stream was recorded more than {MAX_PENDING_SAMPLES} samples ahead of the other; "
-                "record both at the same time"
-            )
-        received = (account.axes.received, account.distance.received)
-        for topic, samples in zip(SCAN_TOPICS, received, strict=True):
-            if not samples:
-                raise BagError(f"{str(self.path)!r} has no samples on {topic!r}; record a scan")
 
 
 def _joined_by_stamps(blocks: Iterator[Any], how: StampJoining) -> Iterator[Any]:
@@ -342,7 +339,11 @@ class _RunningResults:
         (self._axes if isinstance(block, AxisBlock) else self._distance).add(block)
 
     def faults(self, scan: CorrectedScan) -> tuple[str, ...]:
-        """Return findings from counters and stamps; none of axes that are joined by stamps."""
+        """Return findings from counters and stamps; none of axes that are joined by stamps.
+
+        The first is that all points lie on one spot, as those of a step test; the last, that Z left
+        the range in which its pitch was measured.
+        """
         found: list[Notice | str] = [*self._distance.faults("distance")]
         if self._by_counter:
             skew = counter_skew(self._axes, self._distance)
@@ -358,29 +359,22 @@ class _RunningResults:
                 found.append(f"{samples} samples were not corrected: {scan.corrector.slips.found}")
             else:
                 found += skew_fault(skew, scan.sample_period, scan.options.trigger)
-        return (*self._on_one_spot(), *map(str, found), *self._beyond(scan.options.pitch))
-
-    def _on_one_spot(self) -> Iterator[str]:
-        """Yield a fault if all points lie on one spot, as those of a step test."""
-        rows = self.drawn.rows()
+        rows, pitch, (low, high) = self.drawn.rows(), scan.options.pitch, self._z
         if len(rows) and max(np.ptp(rows["x"]), np.ptp(rows["y"])) < SPOT_M:
-            yield (
+            found.insert(
+                0,
                 f"all points lie within {quantity(SPOT_M, 'm')}: X and C did not scan a surface; "
                 "evaluate a step test with 'omsm identify', and test a calibration on one with "
-                "'omsm verify'"
+                "'omsm verify'",
             )
-
-    def _beyond(self, pitch: PitchCurve | None) -> Iterator[str]:
-        """Yield a fault if Z left the range in which its pitch was measured."""
-        if pitch is None:
-            return
-        (low, high), first, last = self._z, pitch.position[0], pitch.position[-1]
-        if low < first or last < high:
-            yield (
+        if pitch is not None and (low < pitch.position[0] or pitch.position[-1] < high):
+            first, last = pitch.position[0], pitch.position[-1]
+            found.append(
                 f"Z goes from {quantity(low, 'm')} to {quantity(high, 'm')}, but its pitch was "
                 f"measured from {quantity(first, 'm')} to {quantity(last, 'm')} and taken as "
                 "constant beyond; measure it over the whole range of Z"
             )
+        return tuple(map(str, found))
 
     def add(self, points: SurfacePoints, packed: NDArray[np.void]) -> None:
         self.drawn.add(packed)

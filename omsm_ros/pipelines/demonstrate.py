@@ -152,20 +152,11 @@ class Demonstration:
             return ""
         return _tcp_link() if second.tcp else f"{self.link}_beside"
 
-    @property
-    def step_test_samples(self) -> int:
-        """Number of samples of the step test."""
-        return len(planned_test_of(self.scenario, self.disturbances).axes)
-
-    @property
-    def scan_samples(self) -> int:
-        """Number of samples of the scan."""
-        return round(spiral_of(self.scenario).duration / self.sample_period)
-
-    @property
-    def second_scan_samples(self) -> int:
-        """Samples of the second scan."""
-        return round(spiral_of(verifying(self.scenario)).duration / self.sample_period)
+    def samples(self) -> tuple[int, int, int]:
+        """Return the number of samples of the step test and of both scans."""
+        test = len(planned_test_of(self.scenario, self.disturbances).axes)
+        scans = (spiral_of(one).duration for one in (self.scenario, verifying(self.scenario)))
+        return (test, *(round(seconds / self.sample_period) for seconds in scans))
 
     def emulator_parameters(self) -> dict[str, object]:
         """Return ROS parameters of the emulator."""

@@ -238,22 +238,14 @@ def form_facts(form: FormResult, measured: OpenedMeasurement) -> dict[str, Any]:
     }
 
 
-def _notes(form: FormResult, measured: OpenedMeasurement) -> list[str]:
-    noise = [] if form.map.noise_known else [_NO_NOISE.format(quantity(form.map.noise, "m"))]
-    x, y, nominal = form.map.x, form.map.y, form.registration.surface
-    unlike = mismatch(x, y, nominal.height(x, y) + form.map.deviation, nominal)
-    more = map(str, (*unlike, *(d.reason for d in form.doubts(decided=True))))
-    return [*measured.notes, *_advice(form), *noise, *more]
-
-
 def _shares(found: Registration, shares: FloatArray) -> dict[str, float]:
     """Return the standard uncertainties of the fitted parameters themselves."""
     named = zip(found.dofs.fitted, map(float, shares), strict=True)
     return {n: external(n, found.placement.value(n), share)[1] or 0.0 for n, share in named}
 
 
-def _advice(form: FormResult) -> list[str]:
-    """Return advice where a fitted or held move and the form cannot be separated."""
+def _notes(form: FormResult, measured: OpenedMeasurement) -> list[str]:
+    """Return notes on the points, and advice where a move and the form cannot be separated."""
     dofs, rms = form.registration.dofs, form.deviation["rms"]
     fitted = [n for n in dofs.fitted if n in MOVES]
     if rms.uncertainty is None or rms.value is None or rms.value >= 2 * rms.uncertainty:
@@ -271,7 +263,11 @@ def _advice(form: FormResult) -> list[str]:
             "uncertainty except those after best-fit alignment; if it is known how well the part "
             f"sits, state that with --placement, or hold it: --fit {others}"
         )
-    return advice
+    noise = [] if form.map.noise_known else [_NO_NOISE.format(quantity(form.map.noise, "m"))]
+    x, y, nominal = form.map.x, form.map.y, form.registration.surface
+    unlike = mismatch(x, y, nominal.height(x, y) + form.map.deviation, nominal)
+    more = map(str, (*unlike, *(d.reason for d in form.doubts(decided=True))))
+    return [*measured.notes, *advice, *noise, *more]
 
 
 def _curves(form: FormResult) -> dict[str, Any]:

@@ -132,11 +132,12 @@ def publish(
 
 
 def publish_form(
-    measured: Path, out: Path, origin: Mapping[str, Any] = MappingProxyType({})
+    measured: Path, out: Path, name: str, origin: Mapping[str, Any] = MappingProxyType({})
 ) -> None:
     """Write ``report.html`` of a registered part from its results in ``out``.
 
     measured: file or folder of the measurement; its summary, if any, is part of the report
+    name: of the measurement, for the title
     origin: entries of the title block
     """
     part = read_points(out / DEVIATION)
@@ -144,8 +145,7 @@ def publish_form(
     summary = summary_of_points(measured) or {}
     # Figures and conformity of this page are those of the form.
     kept = {name: v for name, v in summary.items() if name not in ("figures", "conformity")}
-    title = f"Form of {measured.resolve().name}"
-    publish(out, title, kept, None, {}, embedded([layer]), origin)
+    publish(out, f"Form of {name}", kept, None, {}, embedded([layer]), origin)
 
 
 # Relative difference of the rms of evenly chosen points from that of the whole cloud.

@@ -41,15 +41,8 @@ def path_check_of(
     predicted = through(discretise(calibration.dynamics, record.sample_period), record.z)
     index = np.arange(len(record))
     distance = np.interp(index, index[record.ok], record.distance[record.ok])
-    _check_follows(predicted, -distance / calibration.static_gain)
-    return check_path(record.z, distance, predicted, calibration.static_gain, record.sample_period)
-
-
-def _check_follows(predicted: FloatArray, seen: FloatArray) -> None:
-    """Raise DataError unless the probe's readings follow the motion, as on a fixed target.
-
-    predicted: position of the probe by the model;  seen: by its readings, both (n,) [m]
-    """
+    # The probe's readings must follow the motion, as on a fixed target.
+    seen = -distance / calibration.static_gain
     columns = np.column_stack([predicted - np.mean(predicted)])
     gain = float(least_squares(columns, seen - np.mean(seen))[0])
     check_gain(gain)
@@ -58,6 +51,7 @@ def _check_follows(predicted: FloatArray, seen: FloatArray) -> None:
             "the distance changes with Z in the other direction than in the calibration's step "
             "test; invert its sign in the driver or the map"
         )
+    return check_path(record.z, distance, predicted, calibration.static_gain, record.sample_period)
 
 
 # Bounds memory: an hour at 1 kHz.

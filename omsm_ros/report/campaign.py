@@ -106,7 +106,8 @@ def judge(measurements: Sequence[CampaignEntry]) -> list[JudgedSeries]:
     times = _times(measurements)
     found = []
     for series in SERIES:
-        values = np.array([_value(m, series) for m in measurements])
+        stated = [part(m.summary, *series.place) for m in measurements]
+        values = np.array([v if isinstance(v, int | float) else np.nan for v in stated], float)
         if np.any(np.isfinite(values)):
             drift = trend(times, values) if series.judged else None
             usual = np.nanmedian(values)
@@ -139,30 +140,19 @@ def remarks(measurements: Sequence[CampaignEntry], judged: Sequence[JudgedSeries
             unit = "K" if one.series is TEMPERATURE else one.series.unit
             low, high = (quantity(s * DAY_S, unit) for s in (one.drift.low, one.drift.high))
             found.append(f"{one.series.name} drifts by {low} to {high} per day (95 %)")
-    found += _temperature_correlation(judged)
-    if sum(m.state == "done" for m in measurements) < FEWEST:
-        found.append(f"outliers and drift: not evaluated, fewer than {FEWEST} measurements")
-    return found
-
-
-def _temperature_correlation(judged: Sequence[JudgedSeries]) -> list[str]:
-    warm = [one.values for one in judged if one.series is TEMPERATURE]
-    found = []
+    warm = next((one.values for one in judged if one.series is TEMPERATURE), None)
     for one in judged:
-        if not warm or one.series is TEMPERATURE or not one.series.judged:
+        if warm is None or one.series is TEMPERATURE or not one.series.judged:
             continue
-        slope = _seen(trend(warm[0], one.values), warm[0], one.values)
+        slope = _seen(trend(warm, one.values), warm, one.values)
         if slope is not None and slope.significant:
             low, high = (quantity(s, one.series.unit) for s in (slope.low, slope.high))
             found.append(
                 f"{one.series.name} depends on the temperature, {low} to {high} per kelvin (95 %)"
             )
+    if sum(m.state == "done" for m in measurements) < FEWEST:
+        found.append(f"outliers and drift: not evaluated, fewer than {FEWEST} measurements")
     return found
-
-
-def _value(measurement: CampaignEntry, series: Series) -> float:
-    value = part(measurement.summary, *series.place)
-    return float(value) if isinstance(value, int | float) else np.nan
 
 
 def _times(measurements: Sequence[CampaignEntry]) -> FloatArray:

@@ -29,77 +29,53 @@ class HasResponse(Protocol):
 
 
 def bode(identified: Calibration, true: HasResponse | None, sample_period: float) -> Figure:
-    """Draw gain, phase, and the error of a motion before and after the correction.
+    """Draw gain and phase [deg], and the error of a motion before and after the correction.
 
     true: the twin's G_m, None if unknown
     sample_period: of the scan that is corrected [s]; its Nyquist frequency ends the axes
     """
     frequency = np.geomspace(_LOWEST_HZ, 0.5 / sample_period, 600)
+    fitted = identified.dynamics.response(frequency)
+    known = None if true is None else true.response(frequency)
+    band = response_band(identified.dynamics, identified.covariance, frequency)
     made, axes = style.figure(6.1, 5.6, rows=3, sharex=True, height_ratios=(1, 1, 1.15))
     gain, phase, error = axes[:, 0]
-    draw_gain(gain, frequency, identified, true, title="Response of the probe to the axis")
-    draw_phase(phase, frequency, identified, true)
-    phase.set_xlabel("")
-    _draw_error(error, frequency, identified, true)
-    return made
-
-
-def draw_gain(
-    axes: Axes,
-    frequency: FloatArray,
-    identified: Calibration,
-    true: HasResponse | None,
-    title: str = "",
-) -> None:
-    """Draw |G_m| with its 95 % band."""
-    magnitude = np.abs(identified.dynamics.response(frequency))
-    band = np.exp(np.minimum(COVERAGE_FACTOR * _band(identified, frequency).gain, _WIDEST))
-    draw_band(axes, frequency, magnitude / band, magnitude, magnitude * band)
-    if true is not None:
-        _draw_true(axes, frequency, np.abs(true.response(frequency)))
-    _frequency_axis(axes, frequency, identified)
-    drawn = magnitude if true is None else np.append(magnitude, np.abs(true.response(frequency)))
-    low, high = float(drawn.min()), float(drawn.max())
-    room = 0.12 * max(high - low, 0.02)
-    axes.set_ylim(low - room, high + room)
+    size, spread = np.abs(fitted), np.exp(np.minimum(COVERAGE_FACTOR * band.gain, _WIDEST))
+    draw_band(gain, frequency, size / spread, size, size * spread)
+    angle, off = _degrees(fitted), COVERAGE_FACTOR * band.phase / DEGREE_RAD
+    draw_band(phase, frequency, angle - off, angle, angle + off)
+    drawn = size
+    if known is not None:
+        look: dict[str, Any] = {"color": style.TRUTH, "linewidth": 1.0, "label": "true"}
+        for ax, value in ((gain, np.abs(known)), (phase, _degrees(known))):
+            ax.plot(frequency, value, linestyle=(0, (4, 2.5)), **look)
+        drawn = np.append(size, np.abs(known))
+    _draw_error(error, frequency, fitted, known, band)
+    for ax in (gain, phase, error):
+        _frequency_axis(ax, frequency, identified)
+    for ax, values, least in ((gain, drawn, 0.02), (phase, angle, 1.0)):
+        room = 0.12 * max(float(np.ptp(values)), least)
+        ax.set_ylim(values.min() - room, values.max() + room)
     if identified.valid_up_to < frequency[-1]:
-        axes.annotate(
+        gain.annotate(
             "not valid", (1, 1), (-4, -4), "axes fraction", "offset points", ha="right",
             va="top", fontsize=style.TEXT_PT - 1, color=style.MUTED,
         )  # fmt: skip
     # The curve starts at 1, so the legend goes to the side with less of the curve.
-    style.legend(axes, loc="upper left" if high - 1 > 1 - low else "lower left")
-    style.label(axes, y="gain [1]", title=title)
+    style.legend(gain, loc="upper left" if drawn.max() - 1 > 1 - drawn.min() else "lower left")
+    style.label(gain, y="gain [1]", title="Response of the probe to the axis")
+    style.label(phase, y="phase [deg]")
+    return made
 
 
-def draw_phase(
-    axes: Axes, frequency: FloatArray, identified: Calibration, true: HasResponse | None
-) -> None:
-    """Draw the phase of G_m [deg] with its 95 % band."""
-    angle = _phase(identified.dynamics, frequency)
-    band = COVERAGE_FACTOR * _band(identified, frequency).phase / DEGREE_RAD
-    draw_band(axes, frequency, angle - band, angle, angle + band)
-    if true is not None:
-        _draw_true(axes, frequency, _phase(true, frequency))
-    _frequency_axis(axes, frequency, identified)
-    room = 0.12 * max(np.ptp(angle), 1.0)
-    axes.set_ylim(angle.min() - room, angle.max() + room)
-    style.label(axes, x="frequency [Hz]", y="phase [deg]")
-
-
-def _band(identified: Calibration, frequency: FloatArray) -> Band:
-    return response_band(identified.dynamics, identified.covariance, frequency)
-
-
-def _phase(system: HasResponse, frequency: FloatArray) -> FloatArray:
-    return np.asarray(np.unwrap(np.angle(system.response(frequency))) / DEGREE_RAD)
+def _degrees(response: ComplexArray) -> FloatArray:
+    return np.asarray(np.unwrap(np.angle(response)) / DEGREE_RAD)
 
 
 def _draw_error(
-    axes: Axes, frequency: FloatArray, identified: Calibration, true: HasResponse | None
+    axes: Axes, frequency: FloatArray, fitted: ComplexArray, known: ComplexArray | None, band: Band
 ) -> None:
-    fitted = identified.dynamics.response(frequency)
-    reference = fitted if true is None else true.response(frequency)
+    reference = fitted if known is None else known
 
     def shown(error: FloatArray) -> FloatArray:
         return np.maximum(error * _NM_PER_UM, _SMALLEST_SHOWN_NM_PER_UM)
@@ -107,18 +83,16 @@ def _draw_error(
     before = shown(np.abs(1 - reference))
     style.logarithmic(axes.yaxis)
     axes.plot(frequency, before, color=style.BEFORE, linewidth=1.4, label="uncorrected")
-    band = _band(identified, frequency)
     bound = COVERAGE_FACTOR * np.hypot(band.gain, band.phase) * np.abs(fitted)
     if np.any(bound > 0):
         floor = np.full_like(frequency, _SMALLEST_SHOWN_NM_PER_UM)
         look: dict[str, Any] = {"color": style.AFTER, "alpha": 0.18, "linewidth": 0}
         label = "corrected, 95 % bound"
         axes.fill_between(frequency, floor, shown(bound), label=label, **look)
-    if true is not None:
+    if known is not None:
         rest = shown(np.abs(fitted - reference))
         axes.plot(frequency, rest, color=style.AFTER, linewidth=1.4, label="corrected, true")
     axes.set_ylim(_SMALLEST_SHOWN_NM_PER_UM, max(before.max() * 3, 1.0))
-    _frequency_axis(axes, frequency, identified)
     style.legend_above(axes)
     style.label(axes, x="frequency of the motion [Hz]", y="error per motion [nm/µm]")
 
@@ -132,11 +106,6 @@ def draw_band(
             frequency, low, high, color=style.AFTER, alpha=0.22, linewidth=0, label="95 % band"
         )
     axes.plot(frequency, middle, color=style.AFTER, linewidth=1.6, label="identified")
-
-
-def _draw_true(axes: Axes, frequency: FloatArray, value: FloatArray) -> None:
-    dashes = (0, (4, 2.5))
-    axes.plot(frequency, value, color=style.TRUTH, linewidth=1.0, linestyle=dashes, label="true")
 
 
 def _frequency_axis(axes: Axes, frequency: FloatArray, identified: Calibration) -> None:

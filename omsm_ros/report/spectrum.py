@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from omsm_ros.core.ripple.density import Density, smoothed
@@ -71,7 +70,11 @@ def densities(
             row.axvline(twice, color=style.MUTED, linewidth=0.8, linestyle=":")
         style.label(row, y=unit, title=f"{style.named(signal.name)}, {what}")
     if not over:
-        _kinds(axes[0, 0], [row for _, named in shown for row in named])
+        kinds = {row.kind for _, named in shown for row in named}
+        for kind in (kind for kind in KINDS if kind in kinds):
+            axes[0, 0].plot([], [], "o", color=COLOURS[kind], markersize=5, label=kind)
+        if kinds:
+            style.legend_above(axes[0, 0])
     along = "wavelength [µm]; dotted: twice the sampling distance"
     style.label(axes[-1, 0], x=along if over else "frequency [Hz]")
     return made
@@ -80,14 +83,6 @@ def densities(
 def _place(frequency: Any, over: bool) -> Any:
     """Return a frequency in time [Hz], or the wavelength of one along the path [µm]."""
     return 1 / frequency / MICROMETRE_M if over else frequency
-
-
-def _kinds(axes: Axes, named: Sequence[NamedLine]) -> None:
-    for kind in KINDS:
-        if any(row.kind == kind for row in named):
-            axes.plot([], [], "o", color=COLOURS[kind], markersize=5, label=kind)
-    if axes.get_legend_handles_labels()[0]:
-        style.legend_above(axes)
 
 
 def motion(spectra: Sequence[tuple[str, Density]], valid_up_to: float | None) -> Figure:

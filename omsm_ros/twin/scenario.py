@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from omsm_ros.core.adjustment.source_evaluation import PASSES, SPHERE, STAND_OFFS, STILL, TURNED
 from omsm_ros.core.kinematics.trajectories import (
     PLANNED_COUNT,
     PLANNED_DWELL_S,
@@ -169,7 +170,6 @@ def _ring_of_stand_offs(radius: float, speed: float, reach: float, turns: int) -
 
 # Of the reference sphere, and how far it is mounted from the axis: only so does centre_y show.
 SPHERE_RADIUS_M, SPHERE_OFFSET_M = 0.05, 1e-3
-SPHERE, STILL, TURNED, PASSES, STAND_OFFS = "sphere", "still", "turned", "passes", "stand_offs"
 
 
 def source_recording(

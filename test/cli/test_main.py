@@ -105,6 +105,13 @@ def test_correct_registers_the_part_in_its_pass(capsys, folder, tmp_path):
     assert summary["figures"]["removed"] == ["piston", "tip", "tilt"]
 
 
+def test_the_page_of_a_scan_names_the_scan(capsys, folder, tmp_path):
+    words = ["form", folder / "scan.mcap", "--calibration", folder / "cal.json", "--nominal",
+             folder / "mirror.yaml", "--fit", "piston,tip,tilt"]  # fmt: skip
+    assert run(capsys, *words, "--out", tmp_path)[0] == 0
+    assert "<title>Form of scan.mcap</title>" in (tmp_path / "report.html").read_text()
+
+
 def test_a_fit_needs_a_surface(capsys, folder, tmp_path):
     words = ["correct", folder / "scan.mcap", "--calibration", folder / "cal.json"]
     status, _, err = run(capsys, *words, "--out", tmp_path, "--fit", "auto")

@@ -62,7 +62,7 @@ class Bench:
         """Return the calibrator's answer after a step test."""
         self.move("step_test")
         held = {"axes_held": 0, "distance_held": 0}
-        _follow(self.node, "calibrator", held, self.plan.step_test_samples, int)
+        _follow(self.node, "calibrator", held, self.plan.samples()[0], int)
         return self.node.call(Identify, "/omsm/calibrator/identify", Identify.Request()).calibration
 
 
@@ -93,7 +93,7 @@ def test_a_scan_with_another_averaging_is_refused_live_and_offline(cell):
 
     belonging = bench.recorded("belonging.mcap", 4)
     cell.wait("its return", lambda: said not in node.text("corrector", "message"))
-    _scan(node, bench.plan, "scan", bench.plan.scan_samples, int)
+    _scan(node, bench.plan, "scan", bench.plan.samples()[1], int)
     assert node.value("corrector", "clouds_published") > 0
     cell.processes.end("recorder")
     with Recording(belonging) as recording:

@@ -22,6 +22,7 @@ from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
 from omsm_ros.errors import DataError
 
 STILL, TURNED, PASSES, STAND_OFFS = "still", "turned", "passes", "stand_offs"
+SPHERE = "sphere"
 # Sources of each kind of recording; noise, rate and walk follow from each.
 _SOURCES: dict[str, tuple[str, ...]] = {
     STILL: (),

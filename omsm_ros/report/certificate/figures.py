@@ -248,13 +248,6 @@ def record(model: SampledModel, inputs: FloatArray, output: FloatArray, run: Fre
     return made
 
 
-def correlation(run: FreeRun) -> Figure:
-    """Draw the autocorrelation of the residual."""
-    made, axes = style.figure(7.4, 2.6)
-    draw_correlation(axes[0, 0], run.residual)
-    return made
-
-
 def certificate_figures_of(calibration: Calibration, fitted: FittedRecord) -> dict[str, bytes]:
     """Return PNG files for the page."""
     certificate = calibration.certificate
@@ -274,9 +267,11 @@ def model_figures_of(
     model: SampledModel, inputs: FloatArray, output: FloatArray, run: FreeRun
 ) -> dict[str, bytes]:
     """Return PNG files for the page."""
+    correlation, axes = style.figure(7.4, 2.6)
+    draw_correlation(axes[0, 0], run.residual)
     made = {
         BAND: response(model),
         RECORD: record(model, inputs, output, run),
-        CORRELATION: correlation(run),
+        CORRELATION: correlation,
     }
     return {name: style.png(figure) for name, figure in made.items()}

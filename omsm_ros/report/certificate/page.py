@@ -9,6 +9,7 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import REJECTED, Certificate, to_json
 from omsm_ros.core.estimation.sampled_model import SCHEMA, FreeRun, SampledModel
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, response_band
+from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.readable import NOTHING, count, measured, percent, plain, probability, quantity
 from omsm_ros.report.certificate import figures as drawn
 from omsm_ros.report.certificate import tables
@@ -88,6 +89,9 @@ def headlines(calibration: Calibration) -> list[Headline]:
     """Return the numbers that a reader looks for first, those that are known."""
     certificate, dynamics = calibration.certificate, calibration.dynamics
     residual, spread = certificate.residual, certificate.static_gain.uncertainty
+    structure = certificate.structure or Structure(
+        len(dynamics.denominator) - 1, len(dynamics.numerator) - 1, dynamics.delay > 0
+    )
     delay = measured(
         dynamics.low_frequency_delay, certificate.response.low_frequency_delay_uncertainty_s, "s"
     )
@@ -112,7 +116,7 @@ def headlines(calibration: Calibration) -> list[Headline]:
             quantity(residual.noise_m, "m"),
             f"residual, rms: {quantity(residual.rms_m, 'm')}",
         ),
-        Headline("Structure", tables.structure_text(tables.structure_of(calibration)), ""),
+        Headline("Structure", tables.structure_text(structure), ""),
     ]
     return [headline for headline in found if headline.value != NOTHING]
 
@@ -170,6 +174,10 @@ def sections(calibration: Calibration, issue: Issue) -> list[Section]:
     """Return all parts below the first screen that have anything to show."""
     certificate = calibration.certificate
     warnings = [(str(warning),) for warning in certificate.warnings]
+    samples = [(k.replace("_", " "), count(n)) for k, n in certificate.residual.samples.items()]
+    further = dict(certificate.further)  # what has no other place on the page
+    if certificate.self_calibration:
+        further["self_calibration"] = certificate.self_calibration
     identity = tables.identity_table(calibration, issue.source, issue.version)
     every = [
         Section("Warnings", (), (Table("", (), warnings),)),
@@ -177,7 +185,7 @@ def sections(calibration: Calibration, issue: Issue) -> list[Section]:
         Section(
             "Fit to the recording",
             ("step", "residual"),
-            (tables.residual_table(certificate), tables.sample_account(certificate)),
+            (tables.residual_table(certificate), Table("Samples", (), samples)),
         ),
         _order(certificate),
         Section(
@@ -205,7 +213,7 @@ def sections(calibration: Calibration, issue: Issue) -> list[Section]:
             (
                 identity,
                 mapping_table("Settings calibrated for", calibration.settings),
-                tables.further_table(certificate),
+                mapping_table("Further entries", further),
             ),
         ),
     ]

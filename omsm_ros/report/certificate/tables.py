@@ -27,7 +27,7 @@ from omsm_ros.readable import (
     superscript,
 )
 from omsm_ros.report.page_parts import fill
-from omsm_ros.report.tables import Table, mapping_table
+from omsm_ros.report.tables import Table
 from omsm_ros.report.verdict import verdict_text
 from omsm_ros.units import MILLISECOND_S, NANOSECONDS_PER_S, PPM
 
@@ -48,14 +48,6 @@ def structure_text(structure: Structure) -> str:
     counts = ((structure.poles, "pole"), (structure.zeros, "zero"))
     parts = [f"{n} {name}{'' if n == 1 else 's'}" for n, name in counts]
     return ", ".join([*parts, "delay" if structure.delay else "no delay"])
-
-
-def structure_of(calibration: Calibration) -> Structure:
-    """Return the structure that was chosen, or that of the coefficients where none is stated."""
-    dynamics = calibration.dynamics
-    return calibration.certificate.structure or Structure(
-        len(dynamics.denominator) - 1, len(dynamics.numerator) - 1, dynamics.delay > 0
-    )
 
 
 def residual_table(certificate: Certificate) -> Table:
@@ -214,15 +206,6 @@ def _power(letter: str, k: int) -> str:
     return f"{letter}{k} [{unit}]"
 
 
-def sample_account(certificate: Certificate) -> Table:
-    """Return the number of samples by what became of them."""
-    rows = [
-        (reason.replace("_", " "), count(number))
-        for reason, number in certificate.residual.samples.items()
-    ]
-    return Table("Samples", (), rows)
-
-
 _LIMITS = (
     ("95 % band of the gain, half-width, at most", "gain", ""),
     ("95 % band of the phase, half-width, at most", "phase_rad", "rad"),
@@ -270,14 +253,6 @@ def identity_table(calibration: Calibration, source: str, version: str) -> Table
     return Table("Identity", (), known_rows(rows, 1))
 
 
-def further_table(certificate: Certificate) -> Table:
-    """Return the entries that have no other place on the page."""
-    rest = dict(certificate.further)
-    if certificate.self_calibration:
-        rest["self_calibration"] = certificate.self_calibration
-    return mapping_table("Further entries", rest)
-
-
 def known_rows(rows: Iterable[tuple[str, ...]], column: int) -> Sequence[tuple[str, ...]]:
     """Return the rows that have something in ``column``."""
     return [row for row in rows if row[column] != NOTHING]
@@ -305,14 +280,12 @@ def _resolved(mode: KnownMode, calibration: Calibration) -> tuple[str, str, str]
         fastest = known
     if mode.frequency > fastest:
         return f"not resolved (faster than {quantity(fastest, 'Hz')})", "unknown", "unknown"
-    return (measured(mode.frequency, mode.frequency_uncertainty, "Hz"), *_oscillation(mode))
-
-
-def _oscillation(mode: KnownMode) -> tuple[str, str]:
+    frequency = measured(mode.frequency, mode.frequency_uncertainty, "Hz")
     if mode.residue is None or mode.residue_uncertainty is None:
-        return "1, by definition", "none"
+        return frequency, "1, by definition", "none"
     residue, spread = (v * MILLISECOND_S**2 for v in (mode.residue, mode.residue_uncertainty))
-    return measured(mode.damping, mode.damping_uncertainty), measured(residue, spread)
+    damping = measured(mode.damping, mode.damping_uncertainty)
+    return frequency, damping, measured(residue, spread)
 
 
 _MECHANICAL_UNITS = {"m1": "kg", "m2": "kg", "k1": "N/m", "k2": "N/m", "c1": "N·s/m", "c2": "N·s/m"}
