@@ -28,7 +28,7 @@ from omsm_ros.pipelines.correct import MOST_DRAWN
 from omsm_ros.pipelines.publish import view_of
 from omsm_ros.report import style
 from omsm_ros.report.measurement.figures import surface_figures
-from omsm_ros.report.response_figures import draw_gain, draw_phase, frequencies
+from omsm_ros.report.response_figures import draw_response
 from omsm_ros.twin.plant import Plant
 
 IMAGES = Path(__file__).parent / "images"
@@ -57,10 +57,9 @@ def overview(folder: Path) -> None:
     cloud = view_of(CloudFile(folder / "whole" / "cloud.ply").read(MOST_DRAWN), 1e-3)
     maps = surface_figures(cloud, PAPER_MIRROR)
     made, axes = style.figure(4.0, 3.35, rows=2, sharex=True)
-    for ax, draw in zip(axes[:, 0], (draw_gain, draw_phase), strict=True):
-        draw(ax, frequencies(calibration), calibration, Plant().dynamics)
-    axes[0, 0].set_xlabel("")
-    style.label(axes[0, 0], title="Response of the probe to the axis")
+    frequency = np.geomspace(0.1, 0.5 / calibration.sample_period, 600)
+    draw_response(*axes[:, 0], frequency, calibration, Plant().dynamics)
+    style.label(axes[1, 0], x="frequency [Hz]")
     drawn = (maps["raw_map"], maps["corrected_map"], style.png(made))
     parts = [imread(io.BytesIO(one))[..., :3] for one in drawn]
     imsave(IMAGES / "overview.png", np.hstack(parts))

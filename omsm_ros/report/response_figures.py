@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, Band, response_band
+from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, response_band
 from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.report import style
@@ -35,25 +35,33 @@ def bode(identified: Calibration, true: HasResponse | None, sample_period: float
     sample_period: of the scan that is corrected [s]; its Nyquist frequency ends the axes
     """
     frequency = np.geomspace(_LOWEST_HZ, 0.5 / sample_period, 600)
-    fitted = identified.dynamics.response(frequency)
-    known = None if true is None else true.response(frequency)
-    band = response_band(identified.dynamics, identified.covariance, frequency)
     made, axes = style.figure(6.1, 5.6, rows=3, sharex=True, height_ratios=(1, 1, 1.15))
     gain, phase, error = axes[:, 0]
+    draw_response(gain, phase, frequency, identified, true)
+    _draw_error(error, frequency, identified, true)
+    return made
+
+
+def draw_response(
+    gain: Axes, phase: Axes, frequency: FloatArray, identified: Calibration,
+    true: HasResponse | None,
+) -> None:  # fmt: skip
+    """Draw |G_m| and its phase [deg] over ``frequency`` (n,) [Hz], each with its 95 % band."""
+    fitted = identified.dynamics.response(frequency)
+    band = response_band(identified.dynamics, identified.covariance, frequency)
     size, spread = np.abs(fitted), np.exp(np.minimum(COVERAGE_FACTOR * band.gain, _WIDEST))
     draw_band(gain, frequency, size / spread, size, size * spread)
     angle, off = _degrees(fitted), COVERAGE_FACTOR * band.phase / DEGREE_RAD
     draw_band(phase, frequency, angle - off, angle, angle + off)
     drawn = size
-    if known is not None:
+    if true is not None:
+        known = true.response(frequency)
         look: dict[str, Any] = {"color": style.TRUTH, "linewidth": 1.0, "label": "true"}
         for ax, value in ((gain, np.abs(known)), (phase, _degrees(known))):
             ax.plot(frequency, value, linestyle=(0, (4, 2.5)), **look)
         drawn = np.append(size, np.abs(known))
-    _draw_error(error, frequency, fitted, known, band)
-    for ax in (gain, phase, error):
-        _frequency_axis(ax, frequency, identified)
     for ax, values, least in ((gain, drawn, 0.02), (phase, angle, 1.0)):
+        _frequency_axis(ax, frequency, identified)
         room = 0.12 * max(float(np.ptp(values)), least)
         ax.set_ylim(values.min() - room, values.max() + room)
     if identified.valid_up_to < frequency[-1]:
@@ -65,7 +73,6 @@ def bode(identified: Calibration, true: HasResponse | None, sample_period: float
     style.legend(gain, loc="upper left" if drawn.max() - 1 > 1 - drawn.min() else "lower left")
     style.label(gain, y="gain [1]", title="Response of the probe to the axis")
     style.label(phase, y="phase [deg]")
-    return made
 
 
 def _degrees(response: ComplexArray) -> FloatArray:
@@ -73,9 +80,11 @@ def _degrees(response: ComplexArray) -> FloatArray:
 
 
 def _draw_error(
-    axes: Axes, frequency: FloatArray, fitted: ComplexArray, known: ComplexArray | None, band: Band
+    axes: Axes, frequency: FloatArray, identified: Calibration, true: HasResponse | None
 ) -> None:
-    reference = fitted if known is None else known
+    fitted = identified.dynamics.response(frequency)
+    reference = fitted if true is None else true.response(frequency)
+    band = response_band(identified.dynamics, identified.covariance, frequency)
 
     def shown(error: FloatArray) -> FloatArray:
         return np.maximum(error * _NM_PER_UM, _SMALLEST_SHOWN_NM_PER_UM)
@@ -89,10 +98,11 @@ def _draw_error(
         look: dict[str, Any] = {"color": style.AFTER, "alpha": 0.18, "linewidth": 0}
         label = "corrected, 95 % bound"
         axes.fill_between(frequency, floor, shown(bound), label=label, **look)
-    if known is not None:
+    if true is not None:
         rest = shown(np.abs(fitted - reference))
         axes.plot(frequency, rest, color=style.AFTER, linewidth=1.4, label="corrected, true")
     axes.set_ylim(_SMALLEST_SHOWN_NM_PER_UM, max(before.max() * 3, 1.0))
+    _frequency_axis(axes, frequency, identified)
     style.legend_above(axes)
     style.label(axes, x="frequency of the motion [Hz]", y="error per motion [nm/µm]")
 
