@@ -174,6 +174,10 @@ DONE, BAD_INPUT, DEFECT = 0, 2, 70  # 70 is EX_SOFTWARE of sysexits.h
 _WIDTH, _INDENT = 79, 14
 
 DEMO = "demo"
+# Where each experiment of the paper is repeated.
+EXPERIMENTS = {"mirror": "paper_mirror:mirror"} | {
+    name: f"paper_experiments:{name}" for name in ("steps", "chirp", "circles", "vibration")
+}
 
 # Commands that pass the arguments after "--" on to another command.
 FORWARD_ARGUMENTS = ("batch",)
@@ -248,13 +252,15 @@ def _declare_demo(add: Arguments) -> None:
     add("--disturbances", str, "errors of the emulated machine", metavar="FILE")
     add("--view", None, "show the scan in a browser")
     add("--seed", SEED, "seed of the twin's noise", default=1)
-    add("--experiment", str, choices=("mirror", "steps", "chirp", "circles", "vibration"))
+    add("--experiment", str, choices=tuple(EXPERIMENTS))
 
 
 def _experiment(args: argparse.Namespace) -> int:
     from omsm_ros.pipelines.paper_experiments import run_experiment
 
-    facts = run_experiment(args.experiment, args.out, args.seed)
+    module, _, task = EXPERIMENTS[args.experiment].partition(":")
+    run = getattr(importlib.import_module(f"omsm_ros.pipelines.{module}"), task)
+    facts = run_experiment(args.experiment, run, args.out, args.seed)
     if args.json:
         print(json_and_yaml.text_of(json_and_yaml.unknown_as_null(facts)), flush=True)
         return DONE

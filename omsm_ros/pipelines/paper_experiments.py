@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.verification import PathCheck
 from omsm_ros.core.estimation.equivalent_time import fast_mode
+from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import Chirp, Circle, StepTest, plan_steps
 from omsm_ros.core.ripple.density import band_stop
 from omsm_ros.core.ripple.exposure import spot_share
@@ -18,7 +20,6 @@ from omsm_ros.core.streams.blocks import AccelerationBlock, FloatArray
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.io.files import EXPERIMENT, REPORT, save_json, save_text
 from omsm_ros.io.folders import EXPERIMENT_FILES, result_folder
-from omsm_ros.pipelines.paper_mirror import calibrated, mirror
 from omsm_ros.pipelines.record_bags import write_recording
 from omsm_ros.pipelines.spectrum import SpectrumOfScan, SpectrumOptions, spectra_of, summary_of
 from omsm_ros.pipelines.verify_calibration import path_check_of
@@ -32,12 +33,12 @@ from omsm_ros.twin.disturbances import Disturbances, VibrationLine
 from omsm_ros.twin.part import AzimuthalRipple
 from omsm_ros.twin.plant import PAPER_DYNAMICS, PAPER_EQ_12
 from omsm_ros.twin.probe import ProbeErrors
-from omsm_ros.twin.scenario import Scenario, on_a_flat
+from omsm_ros.twin.scenario import Scenario, on_a_flat, planned_test_of
 from omsm_ros.twin.sensors import AccelerationSensor, ReferenceSensor
 from omsm_ros.units import DEGREE_RAD, MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M, RPM_HZ
 
 
-def chirp(made: Recording, check: PathCheck, model_lag: FloatArray) -> Figure:
+def chirp_figure(made: Recording, check: PathCheck, model_lag: FloatArray) -> Figure:
     """Draw Fig. 9: path, error over time, its rms and lag by band; ``model_lag``: true [rad]."""
     time = np.arange(len(check.error_before)) * made.axes.sample_period
     path, seen = made.axes.z[-len(time) :], -made.distance.distance[-len(time) :]
@@ -84,10 +85,17 @@ _EXPOSURE_S, _ACCELEROMETER_S = 1e-3, 1e-4
 SPOT_M = 1.8 * MICROMETRE_M
 
 
-def run_experiment(name: str, out: Path, seed: int = 1) -> dict[str, Any]:
-    """Run the experiment ``name`` of :data:`EXPERIMENTS`; write its report, bags and figures."""
+def calibrated(seed: int) -> Calibration:
+    """Return the calibration of a step test of the twin."""
+    return identify(planned_test_of(Scenario(seed=seed)).motion_record()).calibration
+
+
+def run_experiment(
+    name: str, run: Callable[[Path, int], Done], out: Path, seed: int = 1
+) -> dict[str, Any]:
+    """Run the experiment ``name``; write its report, bags and figures."""
     with result_folder(out, EXPERIMENT_FILES) as folder:
-        found = EXPERIMENTS[name](folder, seed)
+        found = run(folder, seed)
         rows = [row._asdict() for row in found.rows]
         facts = {"experiment": name, "seed": seed, "compared": rows, **found.facts}
         save_text(folder / REPORT, found.page)
@@ -95,7 +103,7 @@ def run_experiment(name: str, out: Path, seed: int = 1) -> dict[str, Any]:
     return facts
 
 
-def _steps(out: Path, seed: int) -> Done:
+def steps(out: Path, seed: int) -> Done:
     """Fig. 6: ten steps of 10 µm up and down, probe against capacitive sensor."""
     test = StepTest(step=10 * MICROMETRE_M, rise=0.0)
     errors = Disturbances(
@@ -178,7 +186,8 @@ def _step_rows(peak: float, settled: FloatArray, cell: Cell) -> list[Compared]:
     ]  # fmt: skip
 
 
-def _chirp(out: Path, seed: int) -> Done:
+def chirp(out: Path, seed: int) -> Done:
+    """Fig. 9: a free path from 0 to 15 Hz, error and lag before and after the correction."""
     motion = Chirp()
     calibration = calibrated(seed)
     made = on_a_flat(Scenario(seed=seed + 1), motion)
@@ -209,7 +218,7 @@ def _chirp(out: Path, seed: int) -> Done:
         "lag_at_14_5_hz": lag, "lag_after": left, "true_lag": model,
         "bands": [list(band) for band in check.excited],
     }  # fmt: skip
-    shown = chirp(made, check, true_lag)
+    shown = chirp_figure(made, check, true_lag)
     return done(
         "Free path, 0 to 15 Hz (Fig. 9)",
         f"error {quantity(check.rms_before, 'm')} → {quantity(check.rms_after, 'm')} rms",
@@ -255,7 +264,8 @@ def _highest(scan: SpectrumOfScan) -> tuple[float, float]:
     return over or float("nan"), 1 / along if along else float("nan")
 
 
-def _circles(out: Path, seed: int) -> Done:
+def circles(out: Path, seed: int) -> Done:
+    """Fig. 10, Table 1: tool marks on a circle at four speeds."""
     made = {name: circle_scan(name, seed + k) for k, name in enumerate(TABLE_1)}
     scans, options = _scanned(out, made, seed)
     rows = []
@@ -314,7 +324,8 @@ def _mean_speed(rpm: float) -> float:
     return float(np.sum(np.abs(np.diff(z)))) * rpm * RPM_HZ
 
 
-def _vibration(out: Path, seed: int) -> Done:
+def vibration(out: Path, seed: int) -> Done:
+    """Fig. 11: a vibration whose alias looks like the marks."""
     made = {
         "F2": circle_scan("F2", seed),
         "F3": circle_scan("F3", seed + 1, shaken=True),
@@ -408,12 +419,3 @@ def _spectrum_page(
     table = Table("Lines", columns, lines, prose="evidence")
     facts = {"spectrum": summary_of(scans, options)}
     return done(title, summary, rows, facts, {**figures, **kept}, (table,))
-
-
-EXPERIMENTS: dict[str, Callable[[Path, int], Done]] = {
-    "steps": _steps,
-    "chirp": _chirp,
-    "circles": _circles,
-    "vibration": _vibration,
-    "mirror": mirror,
-}

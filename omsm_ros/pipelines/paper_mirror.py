@@ -6,11 +6,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.comparison.compare import compare_measurements_of_part
 from omsm_ros.core.comparison.stated_errors import ComparedMeasurement
 from omsm_ros.core.correction.predict import dynamic_error
-from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.limits import MachineLimits
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.measured_points import MeasuredPoints
@@ -23,6 +21,7 @@ from omsm_ros.io.files import CLOUD
 from omsm_ros.io.maps.columns_file import write_columns
 from omsm_ros.io.results import MOST_DRAWN, CloudFile
 from omsm_ros.pipelines.measure import measure
+from omsm_ros.pipelines.paper_experiments import calibrated
 from omsm_ros.pipelines.publish import view_of
 from omsm_ros.pipelines.record_bags import write_recording
 from omsm_ros.readable import plain, quantity
@@ -33,7 +32,7 @@ from omsm_ros.report.style import Panel, panels
 from omsm_ros.report.tables import Table
 from omsm_ros.twin.cell import Recording
 from omsm_ros.twin.plant import PAPER_DYNAMICS, PAPER_STATIC_GAIN
-from omsm_ros.twin.scenario import MIRROR_APERTURE, Scenario, planned_test_of, scan_of, spiral_of
+from omsm_ros.twin.scenario import MIRROR_APERTURE, Scenario, scan_of, spiral_of
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M, RPM_HZ
 
 # Figures of Fig. 8: deviation before and after, and sections.
@@ -42,11 +41,6 @@ _OF_MIRROR = (*_MAPS, "profile_x", "profile_y", "profile_diagonal", "profile_rad
 _CLEAR_SHARE = 24.57 / 25.4
 _REFERENCE_POINTS = 23_513
 SCAN = Scenario(start_radius=PAPER_MIRROR_HALF_LENGTH_M)
-
-
-def calibrated(seed: int) -> Calibration:
-    """Return the calibration of a step test of the twin."""
-    return identify(planned_test_of(Scenario(seed=seed)).motion_record()).calibration
 
 
 def explanations() -> list[tuple[str, list[float], str]]:

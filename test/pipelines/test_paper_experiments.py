@@ -1,11 +1,13 @@
 """The paper's experiments reproduce Eq. 12 and Table 1, and the page compares them."""
 
+import importlib
 import json
 
 import numpy as np
 import pytest
 
 from omsm_ros import cli
+from omsm_ros.cli.command_line import EXPERIMENTS
 from omsm_ros.core.calibration.verification import excited_bands
 from omsm_ros.errors import FileError
 from omsm_ros.io import bags
@@ -35,7 +37,7 @@ def figure(facts, name):
 @pytest.mark.soak
 def test_steps_show_the_error_at_an_edge_and_at_rest(tmp_path, capsys):
     """Fig. 6: 2.288 µm by integration of a critically damped 200 Hz axis through Eq. 12."""
-    facts = run_experiment("steps", tmp_path / "s")
+    facts = run_experiment("steps", paper_experiments.steps, tmp_path / "s")
     assert facts["peak"] == pytest.approx(2.288e-6, rel=0.02)
     assert figure(facts, "resonance")[0] == pytest.approx(347 / 338, abs=0.01)
     # The gain of 1.26/1.27 leaves 78.7 nm of each step of 10 µm, and 0.787 µm of 100 µm.
@@ -57,7 +59,7 @@ def test_steps_show_the_error_at_an_edge_and_at_rest(tmp_path, capsys):
 @pytest.mark.soak
 def test_the_circle_of_6_mm_shows_the_printed_figures(tmp_path, monkeypatch):
     monkeypatch.setattr(paper_experiments, "_CIRCLE_SECONDS", 8.0)
-    facts = run_experiment("circles", tmp_path / "c")
+    facts = run_experiment("circles", paper_experiments.circles, tmp_path / "c")
     # An exposure of 1 ms averages marks of 15.9 µm and 11 nm that pass at 0.6 and 1.2 kHz.
     passing = 2 * np.pi * 6e-3 * np.array([15.0, 30.0]) / 60 / 15.9e-6
     expected = np.hypot(11e-9 * abs(np.sinc(passing * 1e-3)), 2e-9)
@@ -131,7 +133,7 @@ def test_the_chirp_lags_as_equation_12_and_is_corrected(tmp_path, capsys):
 
 def test_the_vibration_is_found_folded(tmp_path, monkeypatch):
     monkeypatch.setattr(paper_experiments, "_CIRCLE_SECONDS", 6.0)
-    facts = run_experiment("vibration", tmp_path / "v")
+    facts = run_experiment("vibration", paper_experiments.vibration, tmp_path / "v")
     quiet, shaken, still = facts["spectrum"]["scans"]
     # Marks of 15.9 µm on the 6 mm circle pass at 592.7 Hz: 407.3 Hz at a rate of 1 kHz.
     assert max(still["peaks"], key=lambda p: p["amplitude"])["frequency"] == pytest.approx(
@@ -147,7 +149,7 @@ def test_the_vibration_is_found_folded(tmp_path, monkeypatch):
 @pytest.mark.soak
 def test_the_mirror_loses_its_dynamic_error(tmp_path, monkeypatch):
     monkeypatch.setattr(paper_mirror, "SCAN", Scenario(start_radius=2e-3))
-    facts = run_experiment("mirror", tmp_path / "m")
+    facts = run_experiment("mirror", paper_mirror.mirror, tmp_path / "m")
     found = facts["summary"]["deviation"]
     raw, after = (found[when]["rms_area_weighted"] for when in ("raw", "corrected"))
     assert after < 15e-9
@@ -163,22 +165,28 @@ def test_the_mirror_loses_its_dynamic_error(tmp_path, monkeypatch):
     assert page.count("data:image/png") == 8
 
 
-def test_an_experiment_leaves_what_is_measured_alone(tmp_path, monkeypatch):
+def test_every_experiment_of_the_command_exists():
+    for name, place in EXPERIMENTS.items():
+        module, _, task = place.partition(":")
+        run = getattr(importlib.import_module(f"omsm_ros.pipelines.{module}"), task)
+        assert run.__name__ == name
+
+
+def test_an_experiment_leaves_what_is_measured_alone(tmp_path):
     """A recording or measurement is not overwritten; an earlier experiment is."""
 
     def quick(out, seed):
         (out / "chirp.mcap").write_text(f"of seed {seed}")
         return Done({}, [], "")
 
-    monkeypatch.setitem(paper_experiments.EXPERIMENTS, "chirp", quick)
     for name, said in (("chirp.mcap", "is there and no result"), ("summary.json", "of another")):
         (tmp_path / name).write_text("{}")
         with pytest.raises(FileError, match=said):
-            run_experiment("chirp", tmp_path)
+            run_experiment("chirp", quick, tmp_path)
         assert [(f.name, f.read_text()) for f in tmp_path.iterdir()] == [(name, "{}")]
         (tmp_path / name).unlink()
     for seed in (1, 2):
-        run_experiment("chirp", tmp_path, seed)
+        run_experiment("chirp", quick, tmp_path, seed)
         assert (tmp_path / "chirp.mcap").read_text() == f"of seed {seed}"
 
 

@@ -207,7 +207,7 @@ def test_errors_and_lags_of_a_free_path_are_those_of_their_bands():
         axes=SimpleNamespace(sample_period=1e-3, z=time * 1e-3),
         distance=SimpleNamespace(distance=-time * 1e-3),
     )
-    _, over, rms, lag = experiment_figures.chirp(made, check, np.array([0.1, 0.2])).axes
+    _, over, rms, lag = experiment_figures.chirp_figure(made, check, np.array([0.1, 0.2])).axes
     # The motion states its frequency; the lag is that at the frequency of the Hilbert transform.
     true = np.linspace(0.0, Chirp().end_frequency, count)
     for side in ("before", "after"):
