@@ -67,7 +67,8 @@ def templates() -> Mapping[str, str]:
     """
     found: dict[str, str] = {}
     for room in pkgutil.iter_modules(__path__):
-        mapping = importlib.import_module(f"{__name__}.{room.name}").TEMPLATES
+        written = importlib.import_module(f"{__name__}.{room.name}").TEMPLATES
+        mapping = catalogue(written) if isinstance(written, str) else written
         if twice := found.keys() & mapping.keys():
             raise ValueError(f"messages: codes {sorted(twice)} stand in two rooms")
         found |= mapping

@@ -1,8 +1,6 @@
 """Sentences of the adjustment of several scans: self-calibration and reversal."""
 
-from omsm_ros.messages import catalogue
-
-TEMPLATES = catalogue("""
+TEMPLATES = """
 adjustment.one_scan: {scans} scan, expected two or more of one part, at different speeds or in
     opposite directions
 adjustment.no_common_ring: the scans share no ring: one begins at a radius of {inner!r} m, another
@@ -44,4 +42,4 @@ adjustment.negative_lag: Z would have to move {lag:s} after the reading of the p
 adjustment.recording_kind: recording {kind!r}, expected one of {known:list}
 adjustment.other_motion: the axes do not move as in a recording of the kind {kind!r}; 'omsm sources
     --help' says how each is made
-""")
+"""

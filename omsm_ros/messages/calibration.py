@@ -1,8 +1,6 @@
 """Sentences of :mod:`omsm_ros.core.calibration`."""
 
-from omsm_ros.messages import catalogue
-
-TEMPLATES = catalogue("""
+TEMPLATES = """
 calibration.text: {text}
 # Content of a calibration file or message.
 calibration.severity: finding of severity {severity!r}, expected one of {known}
@@ -73,4 +71,4 @@ calibration.undetected_other: an undetected model error
 calibration.no_common_band: the calibrations have no common band: they are valid up to {limits!r}
     Hz; identify the one that ends lowest again
 calibration.too_few: {count!r} calibrations: repeatability needs three or more
-""")
+"""

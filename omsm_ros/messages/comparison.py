@@ -1,8 +1,6 @@
 """Sentences of the comparison of two measurements."""
 
-from omsm_ros.messages import catalogue
-
-TEMPLATES = catalogue("""
+TEMPLATES = """
 comparison.no_overlap: the two measurements do not overlap; do they lie in one frame, and in one
     unit?
 comparison.too_many_places: a spacing of {spacing:m} makes {columns:.4g} × {rows:.4g} places,
@@ -53,4 +51,4 @@ comparison.not_fitted: {name} was not fitted: {reason}
 comparison.whole_heights: whole heights were compared, of {height:m} PV: a lateral shift of
     {shift:m/2} between the parts changes them by {rms:m/2} rms; to compare deviations, each in the
     frame of its part, give {opt.nominal} SURFACE.yaml {opt.register} auto
-""")
+"""

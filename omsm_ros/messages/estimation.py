@@ -1,8 +1,6 @@
 """Sentences of estimation: records that cannot be fitted, and certificates of sampled models."""
 
-from omsm_ros.messages import catalogue
-
-TEMPLATES = catalogue("""
+TEMPLATES = """
 # Steps.
 estimation.long_travel: Z travels {travel:m}, a probe follows a fixed target over {most:m} at most;
     positions must be in metres
@@ -101,4 +99,4 @@ estimation.residual_follows_input: the residual follows the input ({p:chance}): 
     delay, or something that is not linear
 estimation.order_differs: order {order} was asked for, {free} would have been chosen: its
     uncertainties are taken {factor:plain/2} times as large
-""")
+"""

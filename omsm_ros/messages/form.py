@@ -1,8 +1,6 @@
 """Sentences of form: Zernike terms, filters, offsets of the next cut."""
 
-from omsm_ros.messages import catalogue
-
-TEMPLATES = catalogue("""
+TEMPLATES = """
 form.few_points_for_terms: {points} points for {terms} Zernike terms, expected {least} or more;
     measure more points or ask for fewer terms
 form.no_term: the points determine no Zernike term; check the aperture and the weights
@@ -29,4 +27,4 @@ form.spiral_below_one_turn: spiral of {feed:m} a turn from a rim of {rim:m} make
     turn; take a narrower feed
 form.spiral_too_long: spiral of {feed:m} a turn with {per_turn} places of each makes {lines:count}
     lines, at most {most:count}; take a wider feed
-""")
+"""

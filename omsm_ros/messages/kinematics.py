@@ -1,8 +1,6 @@
 """Sentences about motions: paths, trajectories, step tests."""
 
-from omsm_ros.messages import catalogue
-
-TEMPLATES = catalogue("""
+TEMPLATES = """
 kinematics.pitch: positions of the pitch do not increase; sort them, each once, two or more
 # Path of a scan
 kinematics.left_out: only {judged:count} of {samples:count} samples are judged, triggers {first} to
@@ -33,4 +31,4 @@ kinematics.dwell: step plan: dwell {dwell!r} s leaves no rest after a rise of {r
     {opt.dwell} {least!r} s or longer
 kinematics.lines: step plan: {duration:s} every {period:s} are {lines:count} lines, at most
     {most:count}; plan fewer steps or shorter rests
-""")
+"""

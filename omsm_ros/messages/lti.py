@@ -1,8 +1,6 @@
 """Sentences about transfer functions and their discretisation."""
 
-from omsm_ros.messages import catalogue
-
-TEMPLATES = catalogue("""
+TEMPLATES = """
 lti.coefficients: {name} {values!r} must be a row of finite numbers
 lti.denominator: denominator[0] is {value:g}, expected 1; divide all by it
 lti.last_coefficient: the last coefficient of the denominator is 0; leave it out
@@ -18,4 +16,4 @@ lti.short_motion: motion of shape {shape!r}, expected {least} samples or more; g
 lti.lost_motion: motion has {values!r} values that are not finite; leave them out
 lti.two_mass: two-mass model: {name} is {value!r}, expected a positive number
 lti.few_modes: the two-mass model needs two oscillating modes, the response has {modes!r}
-""")
+"""

@@ -1,8 +1,6 @@
 """Sentences of registration: pose of the part, alignment of the probe."""
 
-from omsm_ros.messages import catalogue
-
-TEMPLATES = catalogue("""
+TEMPLATES = """
 registration.unknown_freedom: pose parameter {name!r} is unknown, expected a list of {known}
 registration.no_parameter: {surface} has no parameter {name!r}; name one of the shape in {opt.fit}
 registration.repeated_freedom: pose parameter {name!r} stands twice; name it once
@@ -39,4 +37,4 @@ registration.centre_not_determined: the scan does not determine the spindle cent
     moved over the sphere; scan across it while the spindle turns
 registration.short_sphere_scan: scan of {points} points, expected {least} or more; record a longer
     one
-""")
+"""

@@ -1,8 +1,6 @@
 """Sentences of ripple: spectra of scans, their lines and sources, the vibration monitor."""
 
-from omsm_ros.messages import catalogue
-
-TEMPLATES = catalogue("""
+TEMPLATES = """
 ripple.acceleration_periods: acceleration with sample periods {periods} s, expected one; record
     again
 ripple.short_acceleration: acceleration of {samples} successive samples, expected {least} or more;
@@ -68,4 +66,4 @@ ripple.slower_scan: a slower scan that resolves finer texture
 ripple.needs_scan: needs {scan}
 ripple.needs_scan_or_accelerometer: needs {scan} or an accelerometer in the bag
 ripple.needs_other_feed: needs a scan with another feed per turn
-""")
+"""

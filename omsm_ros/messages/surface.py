@@ -1,8 +1,6 @@
 """Sentences about nominal surfaces, measured points and deviations."""
 
-from omsm_ros.messages import catalogue
-
-TEMPLATES = catalogue("""
+TEMPLATES = """
 # Nominal surfaces
 surface.terms: {name} has {terms} coefficients, expected {most} at most; leave out the others, or
     describe the surface by a grid
@@ -34,4 +32,4 @@ surface.intervals: spacing {spacing!r} m divides the profile into {intervals:pla
 surface.shapes: form: arrays of shapes {shapes!r}, expected one row of one length each
 surface.empty: form: {name} is empty; give one point or more
 surface.not_finite: form: {bad} of {values} values of {name} are not finite; drop and count them
-""")
+"""
