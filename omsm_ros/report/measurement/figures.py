@@ -33,7 +33,6 @@ Limits = tuple[float, float]
 
 # Share of the pixels within the colour range, so that outliers do not set it.
 _SHOWN_SHARE = 0.998
-_BREAK_AT_GAPS = 4
 # Length over width of a map that is still drawn to scale.
 _NARROW = 5.0
 # Left, bottom, width, height relative to the figure.
@@ -176,11 +175,18 @@ def profile(
 
 
 def _draw_profile(axes: Axes, drawn: Profile, scale: float, **look: Any) -> None:
-    gap = np.diff(drawn.position, prepend=drawn.position[0])
-    breaks = np.flatnonzero(gap > _BREAK_AT_GAPS * np.median(gap))
-    position = np.insert(drawn.position, breaks, np.nan)
-    value = np.insert(drawn.value, breaks, np.nan)
+    position, value = _with_gaps(drawn.position, drawn.value)
     axes.plot(position / MILLIMETRE_M, value / scale, linewidth=1.1, **look)
+
+
+def _with_gaps(position: FloatArray, *values: FloatArray) -> list[FloatArray]:
+    """Return positions and values with NaN where steps are far larger than the others.
+
+    A line over places without points would show what nobody measured.
+    """
+    steps = np.diff(position)
+    empty = np.flatnonzero(steps > _GAP * np.median(steps if len(steps) else 0.0)) + 1
+    return [np.insert(v, empty, np.nan) for v in (position, *values)]
 
 
 def dynamic_error(
@@ -375,7 +381,7 @@ def line_profiles(lines: Mapping[str, Mapping[str, Any]]) -> Figure:
     """Draw deviations [nm] over the position [mm] on each line, with ±2u; one panel per line."""
     made, axes = style.figure(_WIDE, 1.4 * len(lines) + 0.4, rows=len(lines), sharex=True)
     for ax, (name, curve) in zip(axes[:, 0], lines.items(), strict=True):
-        _draw_curve(ax, curve, MILLIMETRE_M, NANOMETRE_M)
+        draw_curve(ax, curve, MILLIMETRE_M, NANOMETRE_M)
         style.label(ax, y="deviation [nm]", title=f"Registered deviation {_FORM_LINES[name]}")
     style.label(axes[-1, 0], x="position on the line [mm]")
     return made
@@ -391,7 +397,7 @@ def ring_profiles(rings: Mapping[str, Mapping[str, Any]]) -> Figure:
     }
     for ax, (name, curve) in zip(axes[:, 0], rings.items(), strict=True):
         unit, x, title = kinds[name]
-        _draw_curve(ax, curve, unit, NANOMETRE_M)
+        draw_curve(ax, curve, unit, NANOMETRE_M)
         style.label(ax, x=x, y="deviation [nm]", title=title)
     return made
 
@@ -403,7 +409,7 @@ def radial_density(curve: Mapping[str, Any]) -> Figure:
     values = np.array(curve["value"], np.float64)
     least = float(np.min(values, where=values > 0, initial=np.max(values)))
     floor = max(_BELOW * least, _LEAST_SHARE * float(values.max()))
-    _draw_curve(ax, curve, 1 / MILLIMETRE_M, _AREAL_UNIT, floor=floor)
+    draw_curve(ax, curve, 1 / MILLIMETRE_M, _AREAL_UNIT, floor=floor)
     style.logarithmic(ax.xaxis, every=(1.0, 2.0, 5.0))
     style.logarithmic(ax.yaxis)
     style.label(
@@ -419,7 +425,7 @@ def direction_density(curve: Mapping[str, Any]) -> Figure:
     """Draw the mean square [nm²] per radian over the direction of waves [°], with ±2u."""
     made, axes = style.figure(_WIDE, _HIGH)
     ax = axes[0, 0]
-    _draw_curve(ax, curve, DEGREE_RAD, NANOMETRE_M**2, floor=0.0)
+    draw_curve(ax, curve, DEGREE_RAD, NANOMETRE_M**2, floor=0.0)
     ax.set_xlim(0, 180)
     ax.set_xticks(range(0, 181, 30))
     title = "Power spectral density over direction"
@@ -449,10 +455,10 @@ def areal_density(areal: Mapping[str, Any]) -> Figure:
     return made
 
 
-def _draw_curve(
+def draw_curve(
     axes: Axes, curve: Mapping[str, Any], along: float, unit: float, *, floor: float | None = None
 ) -> None:
-    """Draw a curve in units of ``along`` and ``unit`` with a band of ±2u.
+    """Draw position, value and uncertainty (n,) of a curve in ``along`` and ``unit``, with ±2u.
 
     floor: lower limit of curve and band; None: they may be negative
     """
@@ -462,11 +468,7 @@ def _draw_curve(
     low, high = (value - 2 * spread) / unit, (value + 2 * spread) / unit
     if floor is not None:
         low, value = np.maximum(low, floor / unit), np.where(value < floor, np.nan, value)
-    # A line over places without points would show what nobody measured.
-    gaps = np.diff(position)
-    empty = np.flatnonzero(gaps > _GAP * np.median(gaps if len(gaps) else 0.0)) + 1
-    place: FloatArray = np.insert(position / along, empty, np.nan)
-    low, value, high = (np.insert(v, empty, np.nan) for v in (low, value, high))
+    place, low, value, high = _with_gaps(position / along, low, value, high)
     axes.fill_between(place, low, high, color=style.AFTER, alpha=0.25, linewidth=0)
     axes.plot(place, value / unit, color=style.AFTER, linewidth=1.0)
     axes.margins(x=0.01)
