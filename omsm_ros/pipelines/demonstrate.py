@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.adjustment import Adjustment
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.correction.correct import CorrectionOptions
-from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources, StatedSource
+from omsm_ros.core.correction.machine_sources import MachineSources, StatedSource
 from omsm_ros.core.correction.surface_points import CLOUD_FIELDS
 from omsm_ros.core.correction.systematic import EVALUATED
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
@@ -33,7 +32,6 @@ from omsm_ros.io.files import (
     save_text,
 )
 from omsm_ros.io.results import CloudFile
-from omsm_ros.pipelines import measure as measurement
 from omsm_ros.pipelines.adjust import (
     ADJUSTED_CLOUD,
     ADJUSTMENT,
@@ -41,9 +39,8 @@ from omsm_ros.pipelines.adjust import (
     adjustment_facts,
     write_adjustment,
 )
-from omsm_ros.pipelines.correct import correct_bag
 from omsm_ros.pipelines.form import RegistrationOptions
-from omsm_ros.pipelines.measure import Judgement, with_sources
+from omsm_ros.pipelines.measure import measure
 from omsm_ros.pipelines.publish import publish_scan
 from omsm_ros.pipelines.record_bags import NOMINAL, write_nominal
 from omsm_ros.readable import now_text, quantity
@@ -225,19 +222,16 @@ _REGISTERING = RegistrationOptions(("piston", "tip", "tilt"))
 def finish_demonstration(plan: Demonstration) -> dict[str, Any]:
     """Correct the first scan offline, adjust both, compare with the truth, write all results."""
     calibration = load_calibration(plan.calibration_file)
-    options = with_sources(CorrectionOptions(), calibration, NOTHING_STATED, PAPER_MIRROR)
-    done = correct_bag(
-        plan.bag, calibration, plan.out / CLOUD, options=options, nominal=PAPER_MIRROR
+    summary = measure(
+        plan.bag, calibration, plan.out, nominal=PAPER_MIRROR, register=_REGISTERING, report=False
     )
     cloud = CloudFile(plan.out / CLOUD).read()
     if not len(cloud):
-        raise OmsmError(f"no point could be corrected: {done.account!r}; see {plan.out / 'log'}")
+        raise OmsmError(
+            f"no point could be corrected: {summary['samples']!r}; see {plan.out / 'log'}"
+        )
     recording = scan_of(plan.scenario, plan.disturbances)
     step_test = planned_test_of(plan.scenario, plan.disturbances)
-    judgement = Judgement(options, out=plan.out)
-    summary = measurement.summarise(plan.bag, done, calibration, judgement)
-    measurement.add_form(plan.out, summary, PAPER_MIRROR, _REGISTERING)
-    measurement.add_verdict(summary, done, calibration, judgement)
     summary["files"] |= {"scan_report": SCAN_REPORT}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
     # Replaces the estimated error by the true one.
