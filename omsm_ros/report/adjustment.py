@@ -11,7 +11,6 @@ from omsm_ros.core.adjustment import Adjustment
 from omsm_ros.core.adjustment.sources import WITH_CALIBRATION
 from omsm_ros.readable import NOTHING, count, expanded, measured, plain, quantity
 from omsm_ros.report import style
-from omsm_ros.report.measurement.figures import draw_curve
 from omsm_ros.report.page_parts import Section, StudyPage, fill_study, title_block
 from omsm_ros.report.tables import Table, sized
 from omsm_ros.report.verdict import headline, page_verdict
@@ -185,8 +184,12 @@ def profiles(found: Adjustment) -> Figure:
         across = form.y * np.cos(angle) - form.x * np.sin(angle)
         near = np.abs(across) < width
         order = np.argsort(along[near])
-        curve = {"position": along, "value": form.height, "uncertainty": form.uncertainty}
-        draw_curve(ax, {n: v[near][order] for n, v in curve.items()}, MILLIMETRE_M, NANOMETRE_M)
+        position = along[near][order] / MILLIMETRE_M
+        height = form.height[near][order] / NANOMETRE_M
+        band = 2 * form.uncertainty[near][order] / NANOMETRE_M
+        ax.fill_between(position, height - band, height + band, color=style.AFTER, alpha=0.2,
+                        linewidth=0)  # fmt: skip
+        ax.plot(position, height, ".-", color=style.AFTER, linewidth=0.9, markersize=3)
         style.label(ax, y="deviation [nm]", title=f"along {name}")
     style.label(axes[-1, 0], x="position [mm]")
     return made

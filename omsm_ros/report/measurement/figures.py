@@ -381,7 +381,7 @@ def line_profiles(lines: Mapping[str, Mapping[str, Any]]) -> Figure:
     """Draw deviations [nm] over the position [mm] on each line, with ±2u; one panel per line."""
     made, axes = style.figure(_WIDE, 1.4 * len(lines) + 0.4, rows=len(lines), sharex=True)
     for ax, (name, curve) in zip(axes[:, 0], lines.items(), strict=True):
-        draw_curve(ax, curve, MILLIMETRE_M, NANOMETRE_M)
+        _draw_curve(ax, curve, MILLIMETRE_M, NANOMETRE_M)
         style.label(ax, y="deviation [nm]", title=f"Registered deviation {_FORM_LINES[name]}")
     style.label(axes[-1, 0], x="position on the line [mm]")
     return made
@@ -397,7 +397,7 @@ def ring_profiles(rings: Mapping[str, Mapping[str, Any]]) -> Figure:
     }
     for ax, (name, curve) in zip(axes[:, 0], rings.items(), strict=True):
         unit, x, title = kinds[name]
-        draw_curve(ax, curve, unit, NANOMETRE_M)
+        _draw_curve(ax, curve, unit, NANOMETRE_M)
         style.label(ax, x=x, y="deviation [nm]", title=title)
     return made
 
@@ -409,7 +409,7 @@ def radial_density(curve: Mapping[str, Any]) -> Figure:
     values = np.array(curve["value"], np.float64)
     least = float(np.min(values, where=values > 0, initial=np.max(values)))
     floor = max(_BELOW * least, _LEAST_SHARE * float(values.max()))
-    draw_curve(ax, curve, 1 / MILLIMETRE_M, _AREAL_UNIT, floor=floor)
+    _draw_curve(ax, curve, 1 / MILLIMETRE_M, _AREAL_UNIT, floor=floor)
     style.logarithmic(ax.xaxis, every=(1.0, 2.0, 5.0))
     style.logarithmic(ax.yaxis)
     style.label(
@@ -425,7 +425,7 @@ def direction_density(curve: Mapping[str, Any]) -> Figure:
     """Draw the mean square [nm²] per radian over the direction of waves [°], with ±2u."""
     made, axes = style.figure(_WIDE, _HIGH)
     ax = axes[0, 0]
-    draw_curve(ax, curve, DEGREE_RAD, NANOMETRE_M**2, floor=0.0)
+    _draw_curve(ax, curve, DEGREE_RAD, NANOMETRE_M**2, floor=0.0)
     ax.set_xlim(0, 180)
     ax.set_xticks(range(0, 181, 30))
     title = "Power spectral density over direction"
@@ -455,7 +455,7 @@ def areal_density(areal: Mapping[str, Any]) -> Figure:
     return made
 
 
-def draw_curve(
+def _draw_curve(
     axes: Axes, curve: Mapping[str, Any], along: float, unit: float, *, floor: float | None = None
 ) -> None:
     """Draw position, value and uncertainty (n,) of a curve in ``along`` and ``unit``, with ±2u.
