@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from importlib import metadata
 from pathlib import Path
 from types import MappingProxyType
@@ -74,42 +74,28 @@ def with_sources(
     )
 
 
-@dataclass(frozen=True)
-class Judgement:
-    """Inputs of the uncertainty evaluation of a scan.
+def _budget(
+    done: Correction, calibration: Calibration, options: CorrectionOptions, stated: MachineSources,
+    discretisation: float, out: Path,
+) -> dict[str, Any]:  # fmt: skip
+    """Return ``budget`` for ``summary.json``, and keep the fields of systematic errors in ``out``.
 
-    options: of its correction;  stated: uncertainty sources of the machine
-    accuracy: required expanded uncertainty, k = 2 [m]
-    out: folder for the fields of its systematic errors, None to keep none
+    discretisation: rms of the digital filter's error on the scan's path [m]
     """
-
-    options: CorrectionOptions
-    stated: MachineSources = NOTHING_STATED
-    accuracy: float | None = None
-    out: Path | None = None
-
-    def budget(
-        self, done: Correction, calibration: Calibration, discretisation: float
-    ) -> dict[str, Any]:
-        """Return ``budget`` for ``summary.json``.
-
-        discretisation: rms of the digital filter's error on the scan's path [m]
-        """
-        options = self.options
-        trace = done.trace.points()
-        budget = scan_budget(
-            calibration,
-            options.sources or ErrorSources.of(calibration),
-            {"discretisation": discretisation}
-            | {n: size for n, size in done.budget.items() if size or n == SCAN_SCATTER},
-            options.geometry,
-            with_assumed(self.stated),
-            trace.with_slopes(options.surface) if len(trace) else trace,
-        )
-        if self.out is not None and len(trace) and resolves_per_turn_waves(trace):
-            kept = scan_fields(budget.fields, done.trace.every, budget.bounds)
-            save_fields(self.out / SYSTEMATIC, kept)
-        return budget.entry()
+    trace = done.trace.points()
+    budget = scan_budget(
+        calibration,
+        options.sources or ErrorSources.of(calibration),
+        {"discretisation": discretisation}
+        | {n: size for n, size in done.budget.items() if size or n == SCAN_SCATTER},
+        options.geometry,
+        with_assumed(stated),
+        trace.with_slopes(options.surface) if len(trace) else trace,
+    )
+    if len(trace) and resolves_per_turn_waves(trace):
+        kept = scan_fields(budget.fields, done.trace.every, budget.bounds)
+        save_fields(out / SYSTEMATIC, kept)
+    return budget.entry()
 
 
 # Beyond this a pose is not linear, and the surface is moved before the scan is adjusted.
@@ -120,43 +106,46 @@ def add_verdict(
     summary: dict[str, Any],
     done: Correction,
     calibration: Calibration,
-    judgement: Judgement,
-    register: RegistrationOptions | None = None,
+    options: CorrectionOptions,
+    stated: MachineSources,
+    accuracy: float | None,
+    register: RegistrationOptions | None,
 ) -> None:
     """Add ``verdict`` and ``figures`` of a single scan to its summary: its adjustment alone.
 
+    options: of the correction;  stated: uncertainty sources of the machine
+    accuracy: required expanded uncertainty, k = 2 [m]
     register: aperture and tolerance of the registration, if there was one
 
     The pose that ``summary["form"]`` aligned is removed; without it piston, tip and tilt. A scan
     that is no spiral is not adjusted: its heights are not verified, and its figures are those of
     the registration.
     """
-    scan, form = done.scan, summary.get("form")
+    scan, form, nominal = done.scan, summary.get("form"), options.surface
     tolerance = None if register is None else register.tolerance
     area = None
-    if register is not None and judgement.options.surface is not None:
-        _, area = within_aperture(judgement.options.surface, register.aperture)
+    if register is not None and nominal is not None:
+        _, area = within_aperture(nominal, register.aperture)
     if scan is not None and area is not None:
         scan = _within(scan, area)
     doubts: list[str] = []
-    if (surface := judgement.options.surface) is not None:
+    if nominal is not None:
         x, y = (done.points[name].astype(np.float64) for name in "xy")
-        doubts += map(str, mismatch(x, y, done.points["height"], surface))
+        doubts += map(str, mismatch(x, y, done.points["height"], nominal))
     doubts += done.faults
     doubts += map(str, _losses(done))
     if scan is None or not scan.is_spiral:
         systematic = summary["budget"]["systematic"]
-        verdict = untested_verdict(2 * systematic, judgement.accuracy, calibration)
+        verdict = untested_verdict(2 * systematic, accuracy, calibration)
         if form is not None:
             summary["figures"] = registered_figures(form)
     else:
-        nominal = judgement.options.surface
         found = adjust(
             [scan],
-            priors_of(judgement.stated, judgement.options.geometry.abbe_arm),
+            priors_of(stated, options.geometry.abbe_arm),
             calibration=calibration,
             nominal=nominal if form is None or nominal is None else _posed(nominal, form),
-            accuracy=judgement.accuracy,
+            accuracy=accuracy,
             removed=POSE if form is None else _aligned(form["removed"]),
         )
         verdict = found.verdict
@@ -286,13 +275,18 @@ def measure(
         bag, calibration, out / CLOUD, options=used, admission=admission, nominal=nominal,
         lateral=lateral, by_stamps=by_stamps,
     )  # fmt: skip
-    judgement = Judgement(used, stated, accuracy, out)
-    summary = summarise(bag, done, calibration, judgement)
+    summary = _summarise(bag, done, calibration, used, stated, out)
     summary["settings"] |= admission.settings or {}
     if done.statistics:
         if register is not None and nominal is not None:
-            add_form(out, summary, nominal, register)
-        add_verdict(summary, done, calibration, judgement, register)
+            # Imported on demand, because most corrections do not register.
+            from omsm_ros.pipelines.form import judge_form, open_measurement
+
+            how = replace(register, tolerance=None)
+            form = judge_form(open_measurement(out), nominal, out, how)
+            summary["form"] = {name: form[name] for name in _OF_FORM}
+            summary["files"] |= {"form": FORM, "deviation": DEVIATION}
+        add_verdict(summary, done, calibration, used, stated, accuracy, register)
     summary |= {"origin": dict(origin)} if origin else {}
     if report:
         summary["files"]["report"] = REPORT
@@ -308,21 +302,10 @@ def measure(
 _OF_FORM = ("pose", "shape", "deviation", "removed", "points", "open")
 
 
-def add_form(
-    out: Path, summary: dict[str, Any], nominal: Surface, register: RegistrationOptions
-) -> None:
-    """Register the cloud in ``out``, and add the result to ``summary``, without conformity."""
-    # Imported on demand, because most corrections do not register.
-    from omsm_ros.pipelines.form import judge_form, open_measurement
-
-    facts = judge_form(open_measurement(out), nominal, out, replace(register, tolerance=None))
-    summary["form"] = {name: facts[name] for name in _OF_FORM}
-    summary["files"] |= {"form": FORM, "deviation": DEVIATION}
-
-
-def summarise(
-    bag: AnyBag, done: Correction, calibration: Calibration, judgement: Judgement
-) -> dict[str, Any]:
+def _summarise(
+    bag: AnyBag, done: Correction, calibration: Calibration, options: CorrectionOptions,
+    stated: MachineSources, out: Path,
+) -> dict[str, Any]:  # fmt: skip
     """Return the content of ``summary.json``; lengths in metres."""
     places: dict[str, Any] = {}
     if isinstance(calibration, CalibrationSet):
@@ -359,12 +342,10 @@ def summarise(
         return summary
     judged = _motion_judged(done, calibration)
     summary["warnings"] += judged.pop("warnings")
-    if (
-        late := excess_latency_text(calibration, judgement.options.probe_latency or 0.0)
-    ) is not None:
+    if (late := excess_latency_text(calibration, options.probe_latency or 0.0)) is not None:
         summary["warnings"].append(str(late))
     of_filter = judged.get("discretisation", {}).get("rms", 0.0)
-    budget = judgement.budget(done, calibration, of_filter)
+    budget = _budget(done, calibration, options, stated, of_filter, out)
     return summary | judged | _figures_of_merit(done) | {"budget": budget}
 
 
