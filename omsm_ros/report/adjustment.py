@@ -11,7 +11,7 @@ from omsm_ros.core.adjustment import Adjustment
 from omsm_ros.core.adjustment.sources import WITH_CALIBRATION
 from omsm_ros.readable import NOTHING, count, expanded, measured, plain, quantity
 from omsm_ros.report import style
-from omsm_ros.report.page_parts import Section, StudyPage, fill_study, title_block
+from omsm_ros.report.page_parts import Section, fill_study, title_block
 from omsm_ros.report.tables import Table, sized
 from omsm_ros.report.verdict import headline, page_verdict
 from omsm_ros.units import MILLIMETRE_M, NANOMETRE_M
@@ -43,28 +43,24 @@ def render(title: str, facts: Mapping[str, Any], found: Adjustment, date: str) -
     if (truth := facts.get("truth")) is not None:
         subtitle.append(f"truth of the twin: PV {quantity(truth[_PV], 'm')}")
     return fill_study(
-        StudyPage(
-            title=f"{origin.get('title') or title}: {headline(facts)}",
-            block=title_block(origin),
-            subtitle="; ".join(subtitle),
-            verdict=replace(verdict, reasons=verdict.reasons[:1]),
-            sections=(
-                Section("Form", ("map",)),
-                Section("Reasons for the verdict", (), (Table("", (), reasons),)),
-                Section(
-                    "Uncertainty and sections",
-                    ("uncertainty", "profiles"),
-                    (_truth(facts), _figures(facts)),
-                ),
-                Section(
-                    "Sources: declared and found", (), (source_table(facts),), tested_text(facts)
-                ),
-                Section("Agreement of the scans", ("agreement",), (_scans(facts),)),
+        title=f"{origin.get('title') or title}: {headline(facts)}",
+        block=title_block(origin),
+        subtitle="; ".join(subtitle),
+        verdict=replace(verdict, reasons=verdict.reasons[:1]),
+        sections=(
+            Section("Form", ("map",)),
+            Section("Reasons for the verdict", (), (Table("", (), reasons),)),
+            Section(
+                "Uncertainty and sections",
+                ("uncertainty", "profiles"),
+                (_truth(facts), _figures(facts)),
             ),
-            captions=CAPTIONS,
-            figures={name: style.png(made) for name, made in figures.items()},
-            footer=f"issued {date} · calibration {facts['calibration']}",
-        )
+            Section("Sources: declared and found", (), (source_table(facts),), tested_text(facts)),
+            Section("Agreement of the scans", ("agreement",), (_scans(facts),)),
+        ),
+        captions=CAPTIONS,
+        figures={name: style.png(made) for name, made in figures.items()},
+        footer=f"issued {date} · calibration {facts['calibration']}",
     )
 
 

@@ -9,7 +9,7 @@ from omsm_ros.core.ripple.density import density
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.readable import count, plain, quantity
 from omsm_ros.report import style
-from omsm_ros.report.page_parts import Section, StudyPage, fill_study
+from omsm_ros.report.page_parts import Section, fill_study
 from omsm_ros.report.tables import Table
 from omsm_ros.report.verdict import PageVerdict
 
@@ -51,7 +51,7 @@ def done(
 ) -> Done:  # fmt: skip
     """Return an experiment with its page; ``figures``: caption, and PNG or figure, by name."""
     first = Table("", ("the paper", "the twin", "ratio", "remark"), rows, prose="remark")
-    page = StudyPage(
+    page = fill_study(
         title=title,
         subtitle="on the digital twin",
         verdict=PageVerdict("neutral", "Result", (summary,)),
@@ -68,7 +68,7 @@ def done(
         footer="Light: Advanced Manufacturing 2025, doi 10.37188/lam.2025.078. The twin has "
         "the dynamics of the paper's Eq. 12, corrected for a missing s.",
     )
-    return Done(facts, rows, fill_study(page))
+    return Done(facts, rows, page)
 
 
 def psd(values: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:

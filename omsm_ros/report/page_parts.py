@@ -109,30 +109,30 @@ class Issue:
         return " · ".join(p for p in (self.source, f"issued {self.date}", identity) if p)
 
 
-@dataclass(frozen=True, slots=True)
-class StudyPage:
-    """A page of a study: verdict, then sections of figures and tables.
+def fill_study(
+    title: str,
+    subtitle: str,
+    verdict: PageVerdict,
+    sections: Sequence[Section],
+    captions: Mapping[str, str],
+    figures: Mapping[str, bytes],
+    **more: object,
+) -> str:
+    """Return the page of a study as HTML: verdict, then sections of figures and tables.
 
-    captions, figures: captions and PNG files by name;  narrow: figures placed three in a row
-    block: entries of the title block
+    captions, figures: captions and PNG files by name
+    more: ``narrow``, figures placed three in a row; ``block``, entries of the title block; and
+        ``footer``
+
+    All text from outside is escaped.
     """
-
-    title: str
-    subtitle: str
-    verdict: PageVerdict
-    sections: tuple[Section, ...]
-    captions: Mapping[str, str] = field(default_factory=dict)
-    figures: Mapping[str, bytes] = field(default_factory=dict)
-    narrow: tuple[str, ...] = ()
-    block: Sequence[tuple[str, str]] = ()
-    footer: str = ""
-
-
-def fill_study(page: StudyPage) -> str:
-    """Return the page as HTML; all text from outside is escaped."""
     return fill(
         "study.html",
-        page=page,
-        sections=present(page.sections, page.figures),
-        picture=lambda name: picture(page.figures[name]),
+        title=title,
+        subtitle=subtitle,
+        verdict=verdict,
+        sections=present(sections, figures),
+        captions=captions,
+        picture=lambda name: picture(figures[name]),
+        **{"narrow": (), "block": (), "footer": "", **more},
     )

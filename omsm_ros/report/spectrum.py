@@ -21,7 +21,7 @@ from omsm_ros.core.ripple.source_hypotheses import (
 )
 from omsm_ros.readable import count, plain, quantity
 from omsm_ros.report import style
-from omsm_ros.report.page_parts import Section, StudyPage, fill_study
+from omsm_ros.report.page_parts import Section, fill_study
 from omsm_ros.report.tables import Table
 from omsm_ros.report.verdict import PageVerdict
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
@@ -161,20 +161,18 @@ def render(summary: Mapping[str, Any], figures: Mapping[str, bytes]) -> str:
     """Return the page of ``spectrum.json`` as HTML; figures: PNG files, as in :data:`CAPTIONS`."""
     scans = summary["scans"]
     return fill_study(
-        StudyPage(
-            title="Lines in the spectrum",
-            subtitle=", ".join(scan["name"] for scan in scans),
-            verdict=_verdict(summary),
-            sections=(
-                Section("Lines", ("time",), tuple(_peak_table(scan) for scan in scans)),
-                Section("Evidence", ("evidence", "path"), (_acceleration_table(scans),)),
-                Section("Scans", ("motion",), (_scan_table(scans), _sampling_table(scans))),
-                Section("Removed", tables=(_stop_table(scans), _vibration_table(scans))),
-            ),
-            captions=CAPTIONS,
-            figures=figures,
-            footer=str(summary["normalisation"]),
-        )
+        title="Lines in the spectrum",
+        subtitle=", ".join(scan["name"] for scan in scans),
+        verdict=_verdict(summary),
+        sections=(
+            Section("Lines", ("time",), tuple(_peak_table(scan) for scan in scans)),
+            Section("Evidence", ("evidence", "path"), (_acceleration_table(scans),)),
+            Section("Scans", ("motion",), (_scan_table(scans), _sampling_table(scans))),
+            Section("Removed", tables=(_stop_table(scans), _vibration_table(scans))),
+        ),
+        captions=CAPTIONS,
+        figures=figures,
+        footer=str(summary["normalisation"]),
     )
 
 

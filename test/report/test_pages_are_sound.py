@@ -26,7 +26,7 @@ from omsm_ros.report.experiments import Compared, done
 from omsm_ros.report.measurement.page import CAPTIONS, Report
 from omsm_ros.report.measurement.page import render as render_report
 from omsm_ros.report.measurement.surface_map import Layer, embedded
-from omsm_ros.report.page_parts import Issue, Section, StudyPage, fill_study
+from omsm_ros.report.page_parts import Issue, Section, fill_study
 from omsm_ros.report.spectrum import render as render_spectrum
 from omsm_ros.report.tables import Table
 from omsm_ros.report.verdict import PageVerdict
@@ -102,10 +102,8 @@ def spectrum(text, _):
 def study(text, _):
     table = Table(text, (text,), [(text, text)], prose=text)
     sections = (Section(text, ("a",), (table,), text),)
-    return fill_study(
-        StudyPage(text, text, PageVerdict("good", text, (text,)), sections, {"a": text}, {"a": PNG},
-                  footer=text)
-    )  # fmt: skip
+    verdict = PageVerdict("good", text, (text,))
+    return fill_study(text, text, verdict, sections, {"a": text}, {"a": PNG}, footer=text)
 
 
 def experiment(text, _):
