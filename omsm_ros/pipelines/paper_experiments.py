@@ -25,9 +25,8 @@ from omsm_ros.pipelines.spectrum import SpectrumOfScan, SpectrumOptions, spectra
 from omsm_ros.pipelines.verify_calibration import path_check_of
 from omsm_ros.readable import plain, quantity
 from omsm_ros.report.experiments import Compared, Done, compared, done, psd
-from omsm_ros.report.spectrum import CAPTIONS, drawn
+from omsm_ros.report.spectrum import CAPTIONS, drawn, peak_table
 from omsm_ros.report.style import Panel, panels
-from omsm_ros.report.tables import Table
 from omsm_ros.twin.cell import Cell, Probe, Recording, record
 from omsm_ros.twin.disturbances import Disturbances, VibrationLine
 from omsm_ros.twin.part import AzimuthalRipple
@@ -403,19 +402,6 @@ def _spectrum_page(
     kept: dict[str, tuple[str, bytes | Figure]] = {
         n: (CAPTIONS[n], made[n]) for n in ("time", "path", "evidence") if n in made
     }
-    lines = [
-        (
-            scan.studied.signal.name,
-            quantity(row.line.possible.get("time"), "Hz", 5),
-            quantity(row.line.amplitude, "m"),
-            plain(row.line.significance),
-            row.kind,
-            "; ".join(map(str, row.evidence)),
-        )
-        for scan in scans
-        for row in scan.named
-    ]
-    columns = ("apparent frequency", "amplitude", "σ", "source", "evidence")
-    table = Table("Lines", columns, lines, prose="evidence")
-    facts = {"spectrum": summary_of(scans, options)}
-    return done(title, summary, rows, facts, {**figures, **kept}, (table,))
+    facts = summary_of(scans, options)
+    tables = tuple(peak_table(scan) for scan in facts["scans"])
+    return done(title, summary, rows, {"spectrum": facts}, {**figures, **kept}, tables)

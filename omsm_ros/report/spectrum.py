@@ -165,7 +165,7 @@ def render(summary: Mapping[str, Any], figures: Mapping[str, bytes]) -> str:
         subtitle=", ".join(scan["name"] for scan in scans),
         verdict=_verdict(summary),
         sections=(
-            Section("Lines", ("time",), tuple(_peak_table(scan) for scan in scans)),
+            Section("Lines", ("time",), tuple(peak_table(scan) for scan in scans)),
             Section("Evidence", ("evidence", "path"), (_acceleration_table(scans),)),
             Section("Scans", ("motion",), (_scan_table(scans), _sampling_table(scans))),
             Section("Removed", tables=(_stop_table(scans), _vibration_table(scans))),
@@ -188,7 +188,8 @@ def _verdict(summary: Mapping[str, Any]) -> PageVerdict:
     return PageVerdict("good", "Source of every line identified", found)
 
 
-def _peak_table(scan: Mapping[str, Any]) -> Table:
+def peak_table(scan: Mapping[str, Any]) -> Table:
+    """Return the lines of one scan of ``spectrum.json``, with their sources."""
     rows = [
         (
             peak["kind"],
