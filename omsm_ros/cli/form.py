@@ -181,13 +181,8 @@ def compensate_form(
         save_text(out / PATH, path_gcode(along))
         path = {"path": PATH, "path_places": len(along.offset), "path_left_out": along.left_out}
     if spiral is not None and tool is not None:
-        (feed, _), (nose, speed), rim = spiral, tool, float(np.max(np.hypot(x, y)[known]))
-        cut = CutSurface(surface, found.x, found.y, total)
-        tip, duration = cut_path(cut, rim, feed, speed, nose)
-        planned = plan_path(tip, duration, _SERVO_PERIOD_S, _CUT_ERROR_M)
-        remark = f"cut at {speed:g} rpm with a nose of {nose / MILLIMETRE_M:g} mm"
-        save_text(out / CUT, program_of(planned, [remark], measures=False))
-        path |= {"cut": CUT, "path_error": planned.error, "cut_duration": duration}
+        cut, rim = CutSurface(surface, found.x, found.y, total), np.max(np.hypot(x, y)[known])
+        path |= _program(cut, float(rim), spiral[0], *tool, out)
     offset, spread = np.abs(found.offset[known]), found.uncertainty[known]
     sure = float(np.mean(offset > _COVERAGE * spread))
     return path | {
@@ -218,6 +213,16 @@ def _offsets(previous: Path, x: FloatArray, y: FloatArray) -> tuple[FloatArray, 
         raise FileError(f"{str(previous)!r} is no {COMPENSATION}: {err}") from err
     found = NearestNDInterpolator(table[:, :2], values)(x, y)
     return found[..., 0], found[..., 1]
+
+
+def _program(
+    surface: Surface, rim: float, feed: float, nose: float, speed: float, out: Path
+) -> dict[str, Any]:
+    path, duration = cut_path(surface, rim, feed, speed, nose)
+    planned = plan_path(path, duration, _SERVO_PERIOD_S, _CUT_ERROR_M)
+    remark = f"cut at {speed:g} rpm with a nose of {nose / MILLIMETRE_M:g} mm"
+    save_text(out / CUT, program_of(planned, [remark], measures=False))
+    return {"cut": CUT, "path_error": planned.error, "cut_duration": duration}
 
 
 def _warnings(sure: float, before: float, after: float) -> list[str]:
