@@ -1,7 +1,7 @@
 """Covariance of fitted parameters in coloured noise."""
 
 import numpy as np
-from scipy import fft
+from scipy import fft, ndimage
 
 from omsm_ros.core.estimation.noise import RandomWalk, scatter_in_time, uneven_rows, with_walk
 from omsm_ros.core.estimation.output_error import Fit, Problem
@@ -74,8 +74,11 @@ def leverage_of(basis: FloatArray, length: int) -> FloatArray:
     degrees of freedom, would understate it (as the leverage of MacKinnon and White 1985 does in
     time).
     """
-    taken = [np.abs(fft.rfft(row, length)) ** 2 for row in basis]
-    return np.asarray(np.sum(taken, axis=0) / basis.shape[1])
+    taken = sum(np.abs(fft.rfft(row, length)) ** 2 for row in basis) / basis.shape[1]
+    # As smooth as an autoregression of the highest order: at a single line that the fit follows,
+    # what is left need not be noise.
+    smooth = ndimage.uniform_filter1d(taken, length // (2 * _MAX_NOISE_ORDER), mode="mirror")
+    return np.asarray(smooth, np.float64)
 
 
 def weighted_gram(rows: FloatArray, length: int, noise: FloatArray) -> FloatArray:
