@@ -123,6 +123,8 @@ class CorrectionState:
         report.values["pairs_held"] = corrector.held
         if slip.samples:
             report.add(ERROR, f"not corrected: {slip}")
+        if corrector.slips.in_doubt:
+            report.add(WARN, "the stamps do not show yet whether both devices count alike: waiting")
         if motion is not None:
             _add_motion(report, slip, motion)
         report.values |= {f"rms_{name}_m": value for name, value in corrector.budget.items()}

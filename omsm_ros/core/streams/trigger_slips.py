@@ -141,6 +141,7 @@ class TriggerSlipDetector:
     sessions: of axes and distance, whose pairs are judged
     found: the last slip, also if it has ended; None if there was none
     same_stamps: both streams carry the stamps of one device, which latches both
+    in_doubt: since the start the stamps neither agree nor show a slip
     """
 
     def __init__(self, axes: StampLine, distance: StampLine, trigger: CommonTrigger) -> None:
@@ -155,6 +156,7 @@ class TriggerSlipDetector:
         self._state = TriggerSlip()
         self._judged, self._since, self._period_ns = -1, 0.0, 1.0
         self._starting, self.same_stamps = True, False  # until the first verdict
+        self.in_doubt = False
         # Per stream: number of stamps, and the last block that began where stamps agree.
         self._stamps, self._shown = [0, 0], [first, first]
         # Count up to which a verdict found no slip; last count with a stamp that is off.
@@ -229,12 +231,12 @@ class TriggerSlipDetector:
         found = self._verdict(rows[:, 1] / self._period_ns)
         if found.samples and len(rows) >= _SURE_STAMPS:
             self._state = self.found = found
-        return bool(found.samples) or (self._starting and self._in_doubt(rows[:, 1]))
+        return bool(found.samples) or (self._starting and self._may_be_slip(rows[:, 1]))
 
     def _agreed_until(self, count: int, period_ns: float) -> int:
         """Return the count up to which stamps have shown that there is no slip."""
         per_s = NANOSECONDS_PER_S / period_ns
-        if self._starting and not self._overdue(count):
+        if self.in_doubt or (self._starting and not self._overdue(count)):
             return self._start
         self._starting = False
         odd = count - self._odd_at <= _SPAN_S * per_s
@@ -243,9 +245,10 @@ class TriggerSlipDetector:
     def _overdue(self, count: int) -> bool:
         return (count - self._start) * self._period_ns > _MOST_WAIT_S * NANOSECONDS_PER_S
 
-    def _in_doubt(self, skew: FloatArray) -> bool:
-        """Return whether ``skew`` (n,) [ns], if it is no slip, may be that of one."""
-        return abs(median(skew)) >= self._steady() * self._period_ns
+    def _may_be_slip(self, skew: FloatArray) -> bool:
+        """Return whether ``skew`` (n,) [ns] may be that of a slip that was not found."""
+        beyond = abs(median(skew)) >= self._steady() * self._period_ns
+        return beyond and not self._state.samples
 
     def _next(self, end: int) -> int:
         pairs = zip(self._lines, self.sessions, strict=True)
@@ -311,10 +314,12 @@ class TriggerSlipDetector:
                 self._starting, self._judged_to = False, count  # stamps show nothing
         else:
             self._state = self._verdict(rows[:, 1] / self._period_ns)
-            if self._starting and not self._state.samples and self._in_doubt(rows[:, 1]):
-                if not self._overdue(count):
-                    return
+            self.in_doubt = self._starting and self._may_be_slip(rows[:, 1])
+            if self.in_doubt and not self._overdue(count):
+                return
+            if self.in_doubt:
                 self._state = self._verdict(rows[:, 1] / self._period_ns, above=0.0)
+                self.in_doubt = False
             self._starting, self._judged_to = False, int(rows[0, 0])
             self._odd = bool(np.any(self._off(rows[:, 1])))
             self.found = self._state if self._state.samples else self.found

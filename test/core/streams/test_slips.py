@@ -345,3 +345,20 @@ def test_what_was_stated_is_checked() -> None:
 
 def _stamped(block: AxisBlock, stamp_ns: int) -> AxisBlock:
     return replace(block, stamp_ns=stamp_ns)
+
+
+@pytest.mark.parametrize("ahead", [0, 1])
+def test_a_start_in_doubt_waits_and_is_refused_after_ten_seconds(ahead: int) -> None:
+    """One trigger less a delay of 0.2 ms is between the limits without and with the scatter."""
+    axes = Device(np.arange(ahead, 12_000), jitter=0.15e-3, regressed=False, seed=1).blocks()
+    distance = Device(np.arange(12_000)).blocks()
+    delayed = [
+        (replace(block, stamp_ns=block.stamp_ns - 200_000), numbers) for block, numbers in axes
+    ]
+    short = [part[:120] for part in (delayed, distance)]  # six seconds
+    early, done = join(*short), join(delayed, distance)
+    assert early.watch is not None
+    assert early.watch.in_doubt == bool(ahead)
+    assert bool(early.axes) != bool(ahead)
+    assert len(done.wrong) == 0
+    assert bool(done.slips[-1]) == bool(ahead)
