@@ -162,7 +162,9 @@ def noise_floor(power: FloatArray, oversampling: int = 1) -> FloatArray:
     for place, centre in enumerate(centres):
         half = int(np.clip(_RELATIVE_WIDTH * centre, narrow, broad))
         low, high = max(centre - half, 0), min(centre + half + 1, count)
-        level[place] = np.median(power[low:high])
+        middle = (high - low - 1) // 2, (high - low) // 2
+        ordered = np.partition(power[low:high], middle)  # np.median takes longer to check its input
+        level[place] = (ordered[middle[0]] + ordered[middle[1]]) / 2
     tiny = np.finfo(float).tiny
     logs = np.interp(np.arange(count), centres, np.log(np.maximum(level, tiny)))
     return np.asarray(np.exp(logs) / _MEDIAN_OVER_MEAN)

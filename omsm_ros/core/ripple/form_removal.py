@@ -216,7 +216,7 @@ class _Basis:
         """Return the values of all columns at the samples ``chosen`` (m,): (m, p)."""
         time = 2 * signal.sample[chosen] / max(int(signal.sample[-1]), 1) - 1
         rho, angle = signal.radius[chosen] / self.largest, 2 * np.pi * signal.turn[chosen]
-        turns = {k: np.exp(1j * k * angle) for k in range(HIGHEST_ORDER + 1)}
+        turns = np.vander(np.exp(1j * angle), HIGHEST_ORDER + 1, increasing=True).T
         found = np.empty((len(chosen), len(self.names)))
         for place, (kind, n, m) in enumerate(self.names):
             if kind == "drift":
