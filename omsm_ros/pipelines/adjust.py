@@ -13,7 +13,6 @@ from omsm_ros.core.adjustment import (
     NOT_VERIFIED,
     VERIFIED,
     Adjustment,
-    Figure,
     FormMap,
     Reason,
     ScanData,
@@ -300,18 +299,18 @@ def adjustment_facts(
         "drift_walk": found.drift_walk,
     }
     if tolerance is not None:
-        facts["conformity"] = conformity_entry(found.form.pv, tolerance)
+        facts["conformity"] = conformity_entry(facts["figures"], tolerance)
     return facts
 
 
 def conformity_entry(
-    pv: Figure, tolerance: float, doubts: Sequence[Mapping[str, Any]] = ()
+    figures: Mapping[str, Any], tolerance: float, doubts: Sequence[Mapping[str, Any]] = ()
 ) -> dict[str, Any] | None:
     """Return whether the peak to valley holds the ``tolerance`` [m] within its uncertainty.
 
-    doubts: ``open`` of the registration
+    figures: as :func:`figures_entry` returns them;  doubts: ``open`` of the registration
     """
-    figure = UncertainValue(pv.value, pv.uncertainty)
+    figure = UncertainValue(*figures["peak_to_valley"].values())
     judged = conformity(figure, tolerance, [Doubt(**doubt) for doubt in doubts])
     return None if judged is None else judged.entry()
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from omsm_ros import __version__
-from omsm_ros.core.adjustment import Figure, Verdict, adjust
+from omsm_ros.core.adjustment import Verdict, adjust
 from omsm_ros.core.adjustment.families import OTHER_SPEED
 from omsm_ros.core.adjustment.figures import POSE
 from omsm_ros.core.adjustment.scan_data import ARRAYS, ScanData
@@ -152,8 +152,7 @@ def add_verdict(
         if nominal is not None:
             summary["figures"] = figures_entry(found.form)
     if tolerance is not None and (figures := summary.get("figures")):
-        pv = Figure(*figures["peak_to_valley"].values())
-        summary["conformity"] = conformity_entry(pv, tolerance, (form or {}).get("open", ()))
+        summary["conformity"] = conformity_entry(figures, tolerance, (form or {}).get("open", ()))
     summary["verdict"] = verdict_entry(verdict, doubts=doubts)
 
 
