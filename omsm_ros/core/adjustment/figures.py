@@ -206,7 +206,7 @@ def largest_contribution(
     """
     solution = made.solution
     known = [f for f in solution.network.families
-             if f.named and f.name in effects and base_name(f.name) not in FREE]  # fmt: skip
+             if f.name in effects and (f.named or f.name in FREE)]  # fmt: skip
     if accuracy is None or not known:
         return None
     family = max(known, key=lambda f: effects[f.name].left)

@@ -12,7 +12,7 @@ from omsm_ros.core.adjustment.agreement import ScanAgreement
 from omsm_ros.core.adjustment.figures import NO_EFFECT, Contribution, Effect
 from omsm_ros.core.adjustment.refutation import Refutation
 from omsm_ros.core.adjustment.scan_data import ScanData
-from omsm_ros.core.adjustment.sources import FREE, VIBRATION, Family, Source, base_name
+from omsm_ros.core.adjustment.sources import VIBRATION, Family, Source, base_name
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import REJECTED
 
@@ -210,11 +210,8 @@ def rests_on(
     limit: a source that may do more if its declaration is worth nothing is one of them [m]
     mirrored: True if C might count the other way, which makes the mirror image of the form
     """
-    found = [
-        f
-        for f in families
-        if base_name(f.name) not in FREE and effects.get(f.name, NO_EFFECT).free > limit
-    ]
+    # A declared pose among them: it looks like form.
+    found = [f for f in families if effects.get(f.name, NO_EFFECT).free > limit]
     by: dict[str, float] = {}
     for family in found:
         by[family.shown_by] = by.get(family.shown_by, 0.0) + effects[family.name].left ** 2

@@ -10,7 +10,7 @@ from disturbed import KINDS
 from plain_world import MIRROR
 from soaked import soaked
 
-from omsm_ros.core.adjustment import CONTRADICTED, VERIFIED, adjust
+from omsm_ros.core.adjustment import CONTRADICTED, VERIFIED, Source, adjust
 
 # Kind, family, its true values (or None where a drawn error adds to it).
 ONE_SCAN = [
@@ -208,3 +208,15 @@ def test_an_accepted_value_refutes_no_more():
     assert found.source("motion_error").refuted
     *_, error = normalised(machine, found)
     assert error < 2 * found.form.mean_uncertainty
+
+
+def test_a_clocking_that_was_declared_counts_as_the_source_that_it_is():
+    """A freeform turned on the chuck looks like form, so the light and the advice name it."""
+    _, made = drawn(3, 2)
+    priors = [p for p in AS_DRAWN if p.name != "clocking"]
+    found = adjust(made, [*priors, Source("clocking", 1e-4, evaluated=True)], nominal=MIRROR,
+                   accuracy=25e-9)  # fmt: skip
+    assert "clocking" in dict(found.verdict.rests_on)
+    (too_large,) = [r for r in found.verdict.reasons if r.code == "uncertainty"]
+    assert too_large.largest.name == "clocking"
+    assert too_large.largest.allowed < 0.5e-4
