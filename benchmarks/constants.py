@@ -15,9 +15,9 @@ import numpy as np
 
 from benchmarks.disturbance_catalogue import CATALOGUE
 from benchmarks.identification import record_once
+from benchmarks.step_test import StepTest
 from omsm_ros.core.calibration.intended_use import PAPER_USE
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.core.surface.nominal import Flat

@@ -22,11 +22,11 @@ import numpy as np
 from benchmarks import named_causes
 from benchmarks.disturbance_catalogue import CATALOGUE, SIZES, together
 from benchmarks.row import Row, at_most, shown
+from benchmarks.step_test import StepTest
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import ACCEPTED, REJECTED
 from omsm_ros.core.calibration.intended_use import PAPER_USE
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import OmsmError

@@ -15,11 +15,12 @@ from benchmarks.against_truth import band_held, coverage, rejected
 from benchmarks.cramer_rao import response_bounds
 from benchmarks.recorded import record_from_arrays
 from benchmarks.row import Row, at_least, at_most, shown
+from benchmarks.step_test import StepTest
 from benchmarks.twin_motions import respond
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.estimation.covariance import inter_sample_motion_covariance
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import Motion, StepPlan, StepTest, plan_steps
+from omsm_ros.core.kinematics.trajectories import Motion, StepPlan, plan_steps
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, response_band
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray

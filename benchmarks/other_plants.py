@@ -12,9 +12,9 @@ import numpy as np
 from benchmarks.against_truth import band_held, inside, mass_errors, mode_errors, over_stated, worst
 from benchmarks.identification import record_once, rms, seeds
 from benchmarks.row import Row, at_least, at_most, between
+from benchmarks.step_test import StepTest
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.modes import FITTED, TwoMass
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.twin.plant import Plant

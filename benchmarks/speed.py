@@ -17,12 +17,12 @@ from scipy import signal
 from benchmarks.correction import SOURCES, corrected, identified_calibration
 from benchmarks.identification import record_once
 from benchmarks.row import Row, at_least, at_most, not_compared
+from benchmarks.step_test import StepTest
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.estimation.sampled_choice import choose_sampled
 from omsm_ros.core.estimation.sampled_fit import SampledRecord
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.discretisation import discretise
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
 from omsm_ros.twin.cell import Recording, blocks_of

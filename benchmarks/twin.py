@@ -10,8 +10,8 @@ import numpy as np
 
 from benchmarks.disturbance_catalogue import CATALOGUE, together
 from benchmarks.row import Row, at_most
+from benchmarks.step_test import StepTest
 from benchmarks.twin_motions import step_test_of
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, Probe, record

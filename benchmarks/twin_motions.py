@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.kinematics.trajectories import Motion, StepTest
+from benchmarks.step_test import StepTest
+from omsm_ros.core.kinematics.trajectories import Motion
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.twin.cell import Recording
 from omsm_ros.twin.disturbances import NOTHING, Disturbances

@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.recorded import record_from_arrays
-from omsm_ros.core.kinematics.trajectories import StepTest
+from benchmarks.step_test import StepTest
 
 PERIOD, LAG, NOISE = 1e-3, 0.7e-3, 10e-9
 STEPS = StepTest()

@@ -18,8 +18,8 @@ from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import (
     PLANNED_COUNT,
     PLANNED_DWELL_S,
+    PLANNED_STEP_M,
     SECOND_SHARE,
-    StepTest,
     plan_steps,
 )
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
@@ -56,7 +56,7 @@ def steps(out, seed):
     """Run the step test; return calibration, recording and counts of the driver."""
     plan = plan_steps(
         sample_period=CYCLE_S,
-        second_step=SECOND_SHARE * StepTest().step,
+        second_step=SECOND_SHARE * PLANNED_STEP_M,
         count=PLANNED_COUNT,
         dwell=PLANNED_DWELL_S,
     )

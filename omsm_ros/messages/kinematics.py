@@ -14,8 +14,6 @@ kinematics.more_gaps: {gaps} more gaps
 # Trajectories
 kinematics.multisine: multisine: {periods} periods and {realisations} realisations, expected 2 or
     more of each; up to {up_to} Hz, expected {least:.3g} to {most:.3g} Hz
-kinematics.step_test: step test: count {count!r} must be 1 or more and dwell {dwell!r} s longer than
-    rise {rise!r} s, which must not be negative
 kinematics.spiral: spiral: start_radius {radius!r} m and feed_per_turn {feed!r} m must be positive,
     spindle_speed {speed!r} rpm not zero
 kinematics.feed: spiral: a feed of {feed!r} m a turn from a radius of {radius!r} m makes less than

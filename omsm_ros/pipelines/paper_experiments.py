@@ -11,7 +11,7 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.verification import PathCheck
 from omsm_ros.core.estimation.equivalent_time import fast_mode
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import Chirp, Circle, StepTest, plan_steps
+from omsm_ros.core.kinematics.trajectories import Chirp, Circle, StepPlan, plan_steps
 from omsm_ros.core.ripple.density import band_stop
 from omsm_ros.core.ripple.exposure import spot_share
 from omsm_ros.core.ripple.source_hypotheses import ALIASED, PART
@@ -104,22 +104,24 @@ def run_experiment(
 
 def steps(out: Path, seed: int) -> Done:
     """Fig. 6: ten steps of 10 µm up and down, probe against capacitive sensor."""
-    test = StepTest(step=10 * MICROMETRE_M, rise=0.0)
+    count, dwell, step = 10, 0.5, 10 * MICROMETRE_M
+    starts = tuple(dwell * (1 + k) for k in range(2 * count))
+    test = StepPlan(starts, (step,) * count + (-step,) * count, 0.0, dwell * (2 * count + 1))
     errors = Disturbances(
         reference=ReferenceSensor(),
         accelerometer=AccelerationSensor(sample_period_s=_ACCELEROMETER_S),
     )
     cell = Cell(seed=seed, probe=Probe(half_range=60 * MICROMETRE_M), disturbances=errors)
-    made = record(cell, test, Flat(), stand_off=-test.step * test.count / 2)
+    made = record(cell, test, Flat(), stand_off=-step * count / 2)
     write_recording(out / "steps.mcap", made)
     assert made.reference is not None
     assert made.acceleration is not None
     time = np.arange(len(made.axes)) * cell.sample_period
     confocal, capacitive = -made.distance.distance, made.reference.distance
-    rest = time < test.dwell / 2
+    rest = time < dwell / 2
     error = confocal - capacitive - np.mean((confocal - capacitive)[rest])
     # Each row is the time from one edge to the next.
-    size = round(test.dwell / cell.sample_period)
+    size = round(dwell / cell.sample_period)
     rows_of = error[: len(error) // size * size].reshape(-1, size)
     settled = rows_of[:, size // 2 :].mean(axis=1)
     peak = float(np.max(np.abs(rows_of[1:] - settled[:-1, np.newaxis])))

@@ -9,11 +9,11 @@ from omsm_ros.core.adjustment.source_evaluation import PASSES, SPHERE, STAND_OFF
 from omsm_ros.core.kinematics.trajectories import (
     PLANNED_COUNT,
     PLANNED_DWELL_S,
+    PLANNED_STEP_M,
     SECOND_SHARE,
     AxisPositions,
     Motion,
     Spiral,
-    StepTest,
     plan_steps,
     s_curve,
 )
@@ -66,11 +66,9 @@ class Scenario:
 
 def planned_test_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
     """Return the step test of ``omsm plan steps`` with half its dwell, on a fixed flat."""
-    step = StepTest().step
     motion = plan_steps(
         sample_period=scenario.sample_period,
-        step=step,
-        second_step=SECOND_SHARE * step,
+        second_step=SECOND_SHARE * PLANNED_STEP_M,
         count=PLANNED_COUNT,
         dwell=PLANNED_DWELL_S / 2,
         rise=scenario.step_rise,

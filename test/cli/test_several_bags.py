@@ -4,8 +4,8 @@ import json
 
 import pytest
 
+from benchmarks.step_test import StepTest
 from omsm_ros import cli
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_multisine

@@ -18,9 +18,9 @@ import pytest
 from omsm_ros.core.adjustment import ScanDesign
 from omsm_ros.core.kinematics.trajectories import (
     PLANNED_COUNT,
+    PLANNED_STEP_M,
     SECOND_SHARE,
     AxisPositions,
-    StepTest,
     plan_steps,
 )
 from omsm_ros.core.streams.blocks import AxisBlock
@@ -245,7 +245,7 @@ def in_cycles(axes):
 def test_filtered_commands_leave_what_is_predicted(tmp_path, rpm, servo):
     """The planner is its model here; servo, structure and encoder are the twin's."""
     cell = Cell(disturbances=Disturbances(servo_bandwidth_hz=servo))
-    second = SECOND_SHARE * StepTest().step
+    second = SECOND_SHARE * PLANNED_STEP_M
     steps = plan_steps(sample_period=1e-3, second_step=second, count=PLANNED_COUNT, dwell=1.0)
     asked = steps.positions(np.arange(round(steps.duration / 1e-3)) * 1e-3)
     axes = in_cycles((asked.x, asked.y, asked.z, asked.b, asked.c))

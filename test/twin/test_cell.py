@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.kinematics.trajectories import StepTest
+from benchmarks.step_test import StepTest
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from omsm_ros.core.kinematics.trajectories import AxisPositions, Circle, StepTest
+from benchmarks.step_test import StepTest
+from omsm_ros.core.kinematics.trajectories import AxisPositions, Circle
 from omsm_ros.core.ripple.density import aliased_frequency
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.core.surface.nominal import Flat

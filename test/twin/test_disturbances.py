@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from benchmarks.disturbance_catalogue import CATALOGUE, SIZES, together
+from benchmarks.step_test import StepTest
 from benchmarks.twin_motions import step_test_of
 from omsm_ros.core.kinematics.kinematics import workpiece_xy
-from omsm_ros.core.kinematics.trajectories import AxisPositions, Spiral, StepTest
+from omsm_ros.core.kinematics.trajectories import AxisPositions, Spiral
 from omsm_ros.core.ripple.density import aliased_frequency
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.errors import ConfigurationError

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from omsm_ros.core.kinematics.trajectories import AxisPositions, StepTest
+from benchmarks.step_test import StepTest
+from omsm_ros.core.kinematics.trajectories import AxisPositions
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, Probe, record

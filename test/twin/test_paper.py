@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from benchmarks.step_test import StepTest
 from benchmarks.twin_motions import respond
-from omsm_ros.core.kinematics.trajectories import Spiral, StepTest
+from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.ripple.density import aliased_frequency
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M

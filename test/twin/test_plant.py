@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from benchmarks.step_test import StepTest
 from benchmarks.twin_motions import respond
-from omsm_ros.core.kinematics.trajectories import AxisPositions, Chirp, Spiral, StepTest
+from omsm_ros.core.kinematics.trajectories import AxisPositions, Chirp, Spiral
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.errors import ConfigurationError

@@ -58,47 +58,6 @@ def _z_only(z: FloatArray) -> AxisPositions:
 
 
 @dataclass(frozen=True, slots=True)
-class StepTest:
-    """Z climbs ``count`` steps and descends them again, with a rest after each edge.
-
-    step: height of a step [m]
-    count: steps up; as many follow down
-    dwell: time from one edge to the next [s]
-    rise: duration of a jerk-limited edge [s]; 0 is a sharp edge
-    """
-
-    step: float = 9.8e-6
-    count: int = 10
-    dwell: float = 0.5
-    rise: float = 20e-3
-
-    def __post_init__(self) -> None:
-        if self.count < 1 or not self.dwell > self.rise >= 0:
-            raise ConfigurationError(
-                "kinematics.step_test", count=self.count, dwell=self.dwell, rise=self.rise
-            )
-
-    @property
-    def duration(self) -> float:
-        """Duration [s], with one dwell before the first edge."""
-        return self.dwell * (2 * self.count + 1)
-
-    def positions(self, time: FloatArray) -> AxisPositions:
-        """Return the commanded axes at ``time`` [s]."""
-        # The rests before the first and after the last edge are edges of zero height.
-        levels = np.r_[np.zeros(1), np.arange(self.count + 1), np.arange(self.count)[::-1]]
-        edge = np.floor(time / self.dwell)
-        index = np.clip(edge, 0, 2 * self.count).astype(np.int64)
-        since = time - index * self.dwell
-        if self.rise > 0:
-            progress = s_curve(since / self.rise)
-        else:
-            progress = (since >= 0).astype(np.float64)
-        before, after = levels[index], levels[index + 1]
-        return _z_only(self.step * (before + (after - before) * progress))
-
-
-@dataclass(frozen=True, slots=True)
 class Spiral:
     """X feeds from ``start_radius`` to the centre while C turns and Z follows ``surface``.
 
@@ -193,6 +152,7 @@ _LEAST_RISE_SAMPLES = 10
 # determines a relaxation as slow as the test to 12 ppm (10 nm of noise at 1 kHz).
 PLANNED_COUNT = 14
 PLANNED_DWELL_S = 2.0
+PLANNED_STEP_M = 9.8e-6
 # Ratio of the second height to the first, 3 µm to 9.8 µm, no simple fraction.
 SECOND_SHARE = 3 / 9.8
 # Lines of a table that a controller reads: a quarter of an hour at 1 kHz, 30 MB.
@@ -226,7 +186,8 @@ class StepPlan:
         starts, heights = np.asarray(self.starts), np.asarray(self.heights)
         levels = np.concatenate([[0.0], np.cumsum(heights)])
         edge = np.maximum(np.searchsorted(starts, time, side="right") - 1, 0)
-        phase = (time - starts[edge]) / self.rise
+        with np.errstate(divide="ignore", invalid="ignore"):  # without a rise edges are sharp
+            phase = (time - starts[edge]) / self.rise
         progress = np.ones_like(phase)
         # Evaluated only within the edges, a hundredth of the time.
         moving = phase < 1
@@ -241,7 +202,7 @@ class StepPlan:
 def plan_steps(
     *,
     sample_period: float,
-    step: float = 9.8e-6,
+    step: float = PLANNED_STEP_M,
     second_step: float | None = None,
     count: int = 10,
     dwell: float = 0.5,

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from soaked import soaked
 
+from benchmarks.step_test import StepTest
 from omsm_ros.cli.calibration import change_text
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.repeatability import compare_calibrations
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface.nominal import Flat

@@ -8,12 +8,12 @@ import pytest
 from certified import certified_by
 from scipy import stats
 
+from benchmarks.step_test import StepTest
 from omsm_ros.cli.calibration import repeatability_text
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import Certificate
 from omsm_ros.core.calibration.repeatability import repeatability
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface.nominal import Flat

@@ -6,6 +6,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from benchmarks.step_test import StepTest
 from benchmarks.twin_motions import respond
 from omsm_ros.core.estimation.model_order import (
     Candidate,
@@ -19,7 +20,6 @@ from omsm_ros.core.estimation.model_order import (
 )
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Problem, fit
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.errors import IdentificationError
 from omsm_ros.twin.plant import Plant

@@ -7,6 +7,7 @@ import pytest
 from soaked import soaked
 
 from benchmarks.recorded import record_from_arrays
+from benchmarks.step_test import StepTest
 from omsm_ros.core.estimation.noise import (
     correct_errors_in_variables,
     plateau_variance,
@@ -17,7 +18,6 @@ from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.estimation.steps import find_steps
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.lti.transfer_function import Structure
 

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.step_test import StepTest
 from omsm_ros.core.estimation.steps import extended, find_steps, sample_noise, segments
-from omsm_ros.core.kinematics.trajectories import Chirp, StepTest, s_curve
+from omsm_ros.core.kinematics.trajectories import Chirp, s_curve
 from omsm_ros.errors import StepTestError
 
 

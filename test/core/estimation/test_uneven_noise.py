@@ -6,9 +6,9 @@ from scipy import signal
 from soaked import soaked
 
 from benchmarks.recorded import record_from_arrays
+from benchmarks.step_test import StepTest
 from omsm_ros.core.estimation.noise import motion_scatter, timing_variance
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepTest
 
 PERIOD, LAG_S, SCATTER_S = 1e-3, 0.34e-3, 50e-6
 TEST = StepTest()

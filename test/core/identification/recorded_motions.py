@@ -5,9 +5,9 @@ from functools import lru_cache
 import numpy as np
 
 from benchmarks.recorded import record_from_arrays
+from benchmarks.step_test import StepTest
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface.nominal import Flat

@@ -5,8 +5,8 @@ import pytest
 from scipy import signal
 
 from benchmarks.recorded import record_from_arrays
+from benchmarks.step_test import StepTest
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.model_errors.families import backlash_lead, through_backlash, without_noise
 
 PERIOD, FINER = 1e-3, 20

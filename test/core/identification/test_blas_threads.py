@@ -14,7 +14,7 @@ _IDENTIFY = """
 import hashlib
 import numpy as np
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepTest
+from benchmarks.step_test import StepTest
 from omsm_ros.core.streams.motion_record import MotionRecord
 from scipy import signal
 from threadpoolctl import threadpool_info

@@ -8,10 +8,11 @@ from scipy import stats
 from soaked import soaked
 
 from benchmarks.identification import record_once
+from benchmarks.step_test import StepTest
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import REJECTED, Certificate
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import Chirp, StepTest
+from omsm_ros.core.kinematics.trajectories import Chirp
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.lti.modes import TwoMass
 from omsm_ros.core.lti.transfer_function import TransferFunction

@@ -5,8 +5,8 @@ import pytest
 from scipy import signal
 
 from benchmarks.recorded import record_from_arrays
+from benchmarks.step_test import StepTest
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.errors import ConfigurationError, DataError, IdentificationError, StepTestError
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.recorded import record_from_arrays
+from benchmarks.step_test import StepTest
 from omsm_ros.core.estimation.model_order import coarser
 from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
@@ -15,7 +16,6 @@ from omsm_ros.core.identification import model_choice
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import choose_model
 from omsm_ros.core.identification.residual_tests import follows_beyond
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.core.streams.motion_record import assemble

@@ -9,6 +9,7 @@ from scipy import signal
 from soaked import soaked
 
 from benchmarks.recorded import record_from_arrays
+from benchmarks.step_test import StepTest
 from omsm_ros.core.calibration.certificate import REJECTS
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.estimation.preparation import prepare
@@ -24,7 +25,6 @@ from omsm_ros.core.identification.model_error_search import (
     search_model_errors,
 )
 from omsm_ros.core.identification.residual_tests import response_difference
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.core.model_errors.families import (

@@ -7,9 +7,9 @@ from soaked import soaked
 
 from benchmarks.disturbance_catalogue import CATALOGUE, SIZES
 from benchmarks.named_causes import RIGHT, UNKNOWN, WRONG, judged
+from benchmarks.step_test import StepTest
 from omsm_ros.core.calibration.certificate import RESERVATION, Finding
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import OmsmError
 from omsm_ros.twin.cell import Cell, record

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from soaked import soaked
 
+from benchmarks.step_test import StepTest
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.lti.modes import FITTED, TwoMass, known_modes
 from omsm_ros.core.lti.transfer_function import TransferFunction

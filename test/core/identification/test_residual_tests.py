@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import signal, stats
 
+from benchmarks.step_test import StepTest
 from benchmarks.twin_motions import respond
 from omsm_ros.core.calibration.verification import check_path
 from omsm_ros.core.estimation.output_error import Problem, fit
@@ -17,7 +18,7 @@ from omsm_ros.core.identification.residual_tests import (
     response_agreement,
     whiteness,
 )
-from omsm_ros.core.kinematics.trajectories import Chirp, StepTest
+from omsm_ros.core.kinematics.trajectories import Chirp
 from omsm_ros.core.lti.frequency_response import frequency_response
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.twin.plant import PAPER_EQ_12, Plant

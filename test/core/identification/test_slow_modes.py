@@ -7,11 +7,11 @@ from scipy import signal
 from soaked import soaked
 
 from benchmarks.recorded import record_from_arrays
+from benchmarks.step_test import StepTest
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
 from omsm_ros.core.identification.model_error_search import search_model_errors
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.model_errors.families import MODE, VIBRATION
 from omsm_ros.core.model_errors.undetected import alternative_mode_covariance

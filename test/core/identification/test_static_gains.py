@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks.recorded import record_from_arrays
+from benchmarks.step_test import StepTest
 from omsm_ros.core.identification.identify import static_gains
-from omsm_ros.core.kinematics.trajectories import Chirp, StepTest
+from omsm_ros.core.kinematics.trajectories import Chirp
 from omsm_ros.errors import StepTestError
 
 

@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 from soaked import soaked
 
+from benchmarks.step_test import StepTest
 from omsm_ros.core.identification.identify import identify, table_mass, two_mass_model
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.modes import FITTED, TwoMass, fit_two_mass
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.motion_record import assemble

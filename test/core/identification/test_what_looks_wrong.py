@@ -6,10 +6,10 @@ from scipy import signal
 from soaked import soaked
 
 from benchmarks.recorded import record_from_arrays
+from benchmarks.step_test import StepTest
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.errors import ConfigurationError, IdentificationError
 
 PERIOD = 1e-3

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.free_path import Multisine
+from benchmarks.step_test import StepTest
 from omsm_ros.core.kinematics.kinematics import Geometry, workpiece_points
 from omsm_ros.core.kinematics.trajectories import (
     Chirp,
     Circle,
     Spiral,
     StepPlan,
-    StepTest,
     plan_csv,
     plan_steps,
     s_curve,

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from benchmarks.free_path import Multisine
-from omsm_ros.core.kinematics.trajectories import Chirp, Circle, Spiral, StepTest, s_curve
+from benchmarks.step_test import StepTest
+from omsm_ros.core.kinematics.trajectories import Chirp, Circle, Spiral, s_curve
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.errors import ConfigurationError
 
@@ -85,9 +86,6 @@ def test_a_multisine_has_its_lines_and_no_others():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: StepTest(count=0),
-        lambda: StepTest(dwell=0.01, rise=0.02),
-        lambda: StepTest(rise=-1.0),
         lambda: Spiral(Flat(), 0.0, 1e-4, 30.0),
         lambda: Spiral(Flat(), 1e-3, 1e-4, 0.0),
     ],

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks.recorded import record_from_arrays
+from benchmarks.step_test import StepTest
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from benchmarks.recorded import record_from_arrays
+from benchmarks.step_test import StepTest
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.estimation.steps import Steps
-from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.model_errors.families import BACKLASH, CREEP, MODE, PERIODIC, low_pass_response
 from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
