@@ -228,15 +228,26 @@ def adjust(
 def _with_its_play(
     scans: Sequence[ScanData], views: Sequence[ScanView], priors: Sequence[Source]
 ) -> tuple[Solution, tuple[Refutation, ...], tuple[Doubt, ...]]:
-    """Return the solution with a backlash as wide as it is found, where the scans refute any."""
+    """Return the solution with a backlash as wide as it is found, where the scans refute any.
+
+    If they do not refute it more surely by that, it is an error of the direction without a width.
+    """
     found, assumed = _fitted(*_network(scans, views, priors), views, priors), 0.0
     for _ in range(_PLAY_STEPS):
         half = _play_of(found[0], assumed)
         if not found[1] or half == assumed:
             break
         assumed, views = half, [replace(v, motion_play=play(v.motion, half)) for v in views]
-        found = _fitted(*_network(scans, views, priors), views, priors)
+        wide = _fitted(*_network(scans, views, priors), views, priors)
+        if _of_play(wide[1]) < _of_play(found[1]):
+            break
+        found = wide
     return found
+
+
+def _of_play(refutations: Sequence[Refutation]) -> float:
+    """Return the gain of the backlash among what was refuted."""
+    return sum(r.evidence.gain for r in refutations if r.name == "motion_error")
 
 
 def _play_of(solution: Solution, assumed: float) -> float:

@@ -165,7 +165,7 @@ def _dynamic(r: Ranges) -> list[Family]:
         Family("lag_c", "s", 2, lambda v: v.motion_rate * np.stack(_waves(v.c, 1)), 1e-4,
                RECLOCKED),
         _one("lag_curvature", "s²", lambda v: -v.motion_acceleration, 1e-5, OTHER_SPEED),
-        _one("creep", "1", lambda v: v.motion_fading, 1e-3, OTHER_SPEED),
+        Family("creep", "1", 2, lambda v: v.motion_fading.T, 1e-3, OTHER_SPEED),
     ]  # fmt: skip
     speeds = np.abs(r.speeds)
     # With one speed, or one direction, the column is that of the lag itself.

@@ -27,7 +27,7 @@ from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zerni
 
 POSE = ("piston", "tip", "tilt")
 """What is fitted by default; ``x``, ``y`` and ``clocking`` may be too."""
-# Points around the rim, where a form of high order has its peaks.
+# Directions to the rim, where a form of high order has its peaks.
 _RIM = 96
 # Draws: a standard deviation to 4 %.
 _DRAWS = 300
@@ -342,7 +342,7 @@ def _rms(places: Places, shapes: FloatArray) -> float:
 
 
 def places_of(solution: Solution, within: BoolArray | None = None) -> Places:
-    """Return the centre of the blocks of every cell that was scanned, and points of the rim.
+    """Return the centre of the blocks of every cell that was scanned, and the outermost blocks.
 
     within: cells to which they are confined
     """
@@ -357,17 +357,20 @@ def places_of(solution: Solution, within: BoolArray | None = None) -> Places:
     # Towards the rim cells are narrower than blocks: one without a block between two that have
     # some is scanned too, and they stand for half of it each.
     between = np.roll(number > 0, 1) & (number == 0) & np.roll(number > 0, -1)
-    angle = 2 * np.pi * np.arange(_RIM) / _RIM
-    rim_x = part.disc.x + part.disc.radius * np.cos(angle)
-    rim_y = part.disc.y + part.disc.radius * np.sin(angle)
-    cell = part.cell_of(rim_x, rim_y)
-    kept = (number > 0)[cell] | between[cell]
+    # In each direction the outermost block: terms of high degree are no extrapolation.
+    u, v = part.disc.scaled(blocks.x, blocks.y)
+    # Blocks lie in the middle of a sector of the turn; a quarter off, none is near an end.
+    sector = np.floor(np.arctan2(v, u) * (_RIM / (2 * np.pi)) + 0.25) % _RIM
+    sector[number[part.cell] == 0] = _RIM
+    outwards = np.lexsort((np.hypot(u, v), sector))
+    rim = outwards[np.flatnonzero(np.diff(sector[outwards], append=_RIM + 1))]
+    rim = rim[sector[rim] < _RIM]
     weights = (1 + np.roll(between, 1) / 2 + np.roll(between, -1) / 2)[seen]
     return Places(
-        np.append(x, rim_x[kept]),
-        np.append(y, rim_y[kept]),
-        np.append(seen, cell[kept]),
-        np.append(weights / np.sum(weights), np.zeros(np.count_nonzero(kept))),
+        np.append(x, blocks.x[rim]),
+        np.append(y, blocks.y[rim]),
+        np.append(seen, part.cell[rim]),
+        np.append(weights / np.sum(weights), np.zeros(len(rim))),
     )
 
 

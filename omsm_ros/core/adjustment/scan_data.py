@@ -32,7 +32,7 @@ _LEAST_TURNS = 3.0
 # At the 12th harmonic of a turn a second the rate is 1 % short.
 _HALF_WINDOW_S, _POLYNOMIAL = 12e-3, 4
 # Creep of guides and mounts that a step test with plateaus of half a second does not show.
-_CREEP_S = 2.0
+_CREEP_S = (2.0, 15.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -124,7 +124,7 @@ class ScanView:
     x_rate, y_rate: of the path over the part [m/s];  slope_x, slope_y: of the surface, part frame
     motion, motion_rate, motion_acceleration: of Z [m], [m/s], [m/s²]
     motion_play: 1 upwards, −1 downwards, or by an assumed backlash: see :func:`play`
-    motion_fading: mean of the motion over the last seconds less the motion: creep [m]
+    motion_fading: mean of the motion over the last seconds less the motion: creep [m], (n, 2)
     distance: that the probe would measure of a part without form error [m]
     deviation: height less nominal height [m]
     speed: of the spindle [rad/s];  index: of the scan
@@ -205,9 +205,9 @@ def view_of(scan: ScanData, index: int, zero: Zero, nominal: Surface) -> ScanVie
     deviation = scan.height - zero.height - nominal.height(x, y)
     # Creep: the mean of the motion over the last seconds, fading, less the motion.
     motion_rate = _rate(scan.time, scan.motion)
-    step = float(np.median(np.diff(scan.time))) / _CREEP_S
-    start = [scan.motion[0] * (1 - step)]
-    followed, _ = scipy.signal.lfilter([step], [1, step - 1], scan.motion, zi=start)
+    steps, first = float(np.median(np.diff(scan.time))) / np.array(_CREEP_S), scan.motion[0]
+    followed = [scipy.signal.lfilter([step], [1, step - 1], scan.motion, zi=[first * (1 - step)])[0]
+                for step in steps]  # fmt: skip
     return ScanView(
         time=scan.time - zero.time,
         since=scan.time - scan.time[0],
@@ -225,7 +225,7 @@ def view_of(scan: ScanData, index: int, zero: Zero, nominal: Surface) -> ScanVie
         motion_rate=motion_rate,
         motion_play=np.sign(motion_rate),
         motion_acceleration=_of_neighbours(scan, _rate(scan.time, scan.motion, 2)),
-        motion_fading=followed - scan.motion,
+        motion_fading=(followed - scan.motion).T,
         # The measured distance holds the form itself, as a regressor it would take it away.
         distance=scan.distance - zero.distance - deviation,
         removed=scan.removed,

@@ -163,6 +163,7 @@ class Machine:
         made = made + lag * z_rate
         made = made + wrong.get("warming", 0.0) * (1 - np.exp(-(self.begin + t) / 150.0))
         made = made + wrong.get("creep", 0.0) * _fading(z, 2.0 * self.rate)
+        made = made + wrong.get("slow_creep", 0.0) * _fading(z, 8.0 * self.rate)
         made = made + wrong.get("stretch", 0.0) * z
         made = made + wrong.get("backlash", 0.0) * np.sign(z_rate)
         if "play" in wrong:

@@ -28,7 +28,7 @@ ONE_SCAN = [
 ]
 # A second scan corrects what one refutes: one kind always, the others in `make soak`.
 TWO_SCANS = [
-    ("creep", "creep", [3e-4]),
+    ("creep", "creep", [3e-4, 0.0]),
     *soaked(
         *(getattr(kind, "values", kind) for kind in ONE_SCAN),
         ("latency", "lag_change", None),
@@ -220,3 +220,20 @@ def test_a_clocking_that_was_declared_counts_as_the_source_that_it_is():
     (too_large,) = [r for r in found.verdict.reasons if r.code == "uncertainty"]
     assert too_large.largest.name == "clocking"
     assert too_large.largest.allowed < 0.5e-4
+
+
+def named(found):
+    return [r.names for r in found.verdict.reasons if r.code in ("refuted", "undeclared_effect")]
+
+
+def test_an_error_of_the_direction_without_a_width_is_named_alone():
+    """30 nm with the sign of the rate of Z: a backlash as wide would leave waves of the spindle."""
+    _, found = disturbed("backlash", 2)
+    assert named(found) == [("motion_error",)]
+
+
+def test_a_creep_over_many_seconds_is_a_creep():
+    """Of 8 s, of which the step test shows nothing."""
+    _, made = drawn(0, 2, slow_creep=3e-4)
+    found = adjust(made, AS_DRAWN, nominal=MIRROR, accuracy=25e-9)
+    assert "creep" in named(found)[0]

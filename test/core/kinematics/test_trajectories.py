@@ -84,11 +84,7 @@ def test_a_multisine_has_its_lines_and_no_others():
 
 
 @pytest.mark.parametrize(
-    "make",
-    [
-        lambda: Spiral(Flat(), 0.0, 1e-4, 30.0),
-        lambda: Spiral(Flat(), 1e-3, 1e-4, 0.0),
-    ],
+    "make", [lambda: Spiral(Flat(), 0.0, 1e-4, 30.0), lambda: Spiral(Flat(), 1e-3, 1e-4, 0.0)]
 )
 def test_impossible_motions_are_refused(make):
     with pytest.raises(ConfigurationError):
