@@ -156,9 +156,12 @@ def dynamic_gain(e: IdentificationEvidence) -> Findings:
     if half_width <= e.limits.gain:
         return
     values = {"half_width": half_width, "time_constant_s": time_constant, "plateau_s": plateau}
-    place = "within" if time_constant <= plateau else "beyond"
-    code, limits = f"identification.creep_{place}_plateau", {"gain": e.limits.gain}
-    yield Finding(code, REJECTS, values, limits)
+    code = (
+        "identification.creep_within_plateau"
+        if time_constant <= plateau
+        else "identification.creep_beyond_plateau"
+    )
+    yield Finding(code, REJECTS, values, {"gain": e.limits.gain})
 
 
 _DIFFERENT_PARTS = {
