@@ -274,7 +274,8 @@ class FormOf:
         values = net.part.values(places.x, places.y)
         height = values @ solution.values[net.terms] + found[places.cell]
         # The cells follow from the parameters: a − A β.
-        rows = -(net.cell_sums(scales)[places.cell] * share[places.cell, np.newaxis])
+        rows = net.cell_sums(scales)[places.cell]
+        rows *= -share[places.cell, np.newaxis]
         rows[:, net.terms] += values
         columns, fit = _pose(places, nominal, removed)
         number = len(height)
