@@ -1,11 +1,12 @@
 """Estimate peak to valley of a part, free of the bias by noise and systematic errors.
 
 Errors increase a peak to valley on average. Drawing errors of the same size once more shows by how
-much, because squares of such figures add where either errors or form dominate. With F of the
-deviations and F' with errors drawn anew
+much. If a power p of the figure grows with the same power of the size of the errors, then with F of
+the deviations and F' with errors drawn anew
 
-    F² of the part = 2 F² − mean F'²
+    F^p of the part = F^p − (mean F'^p − F^p) / (2^(p/2) − 1)
 
+with p = 2 for errors of smooth shape, and less for noise, for which points compete
 (simulation and extrapolation; J. Cook, L. Stefanski, J. Am. Stat. Assoc. 89, 1314). Before, smooth
 terms, means of neighbours and a Wiener filter remove most of the noise; the rest counts as an
 error. Form taken for a move and upper bounds count as in :mod:`omsm_ros.core.form.part_figures`.
@@ -46,6 +47,9 @@ _CONDITION = 1e7
 # Two hundred points for each of the 91 terms up to order 12; two thousand show the extent of a
 # smooth form.
 _MOST_FITTED, _MOST_DRAWN = 20_000, 2_000
+# Noise adds to an extent with the first power of its size where many points compete for it, with
+# the second where one has it. The middle is used, the others are limits of a uniform error.
+_POWERS = (1.0, 1.5, 2.0)
 # 200 draws give a standard deviation to 5 %.
 _DRAWS, _SEED = 200, 7
 # Halvings of the cells that show local features, and points at either extreme.
@@ -134,8 +138,10 @@ class _PartForm(NamedTuple):
         value[local], error[local], cell[local] = form, noise, len(map_) + own
         blurred = (1 - share) * float(np.sqrt(more))
         waves, unseen = _texture(map_, map_.deviation - value), np.zeros((2, len(map_)))
-        for at, other, *_ in others:
-            unseen[:, at] = np.maximum(unseen[:, at], np.outer((-1, 1), other - value[at]))
+        for at, other, _, scatter in others:
+            chance = 2 * np.hypot(scatter, error[at])
+            more = np.outer((-1, 1), other - value[at]) - chance
+            unseen[:, at] = np.maximum(unseen[:, at], more)
         return cls(value, fit, cell, error, value - mean, local, blurred, waves, unseen)
 
     def extents(
@@ -155,7 +161,8 @@ class _PartForm(NamedTuple):
         for ends, all_, count in (((0.0, 1.0), form, len(some)), (ROBUST, many, len(even))):
             of_some, *ways = (_extents(way[:count], ends) for way in (form[some], *drawn))
             again, more, likely, full, noise = (way**2 for way in ways)
-            square = float(of_some**2 - np.mean(again) + np.mean(likely))
+            bare, open_ = _without_noise(float(of_some), ways[-1])
+            square = bare * abs(bare) - float(np.mean(again - noise) - np.mean(likely) + of_some**2)
             of_bounds, of_taken = (
                 float(np.sqrt(np.mean(v**2))) for v in (more - again, full - np.mean(likely))
             )
@@ -164,12 +171,25 @@ class _PartForm(NamedTuple):
             of_errors = length(*np.std([again, noise], axis=1))
             # An extent has two ends, each blurred independently.
             of_blur = 2 * of_some * np.sqrt(2) * self.blurred
-            figure = of_square(square, length(of_errors, of_bounds, of_taken, of_blur))
+            of_all = length(of_errors, of_bounds, of_taken, of_blur, 2 * float(of_some) * open_)
+            figure = of_square(square, of_all)
             between = np.append(np.maximum(beyond, of_waves), -alone) / 2 * (all_ is form)
             value = (figure.value or 0.0) + _extents(all_, ends) - of_some + float(np.sum(between))
             spread = length(figure.uncertainty or 0.0, *between)
             found.append(UncertainValue(float(value), spread))
         return found[0], found[1], more_square
+
+
+def _without_noise(once: float, again: FloatArray) -> tuple[float, float]:
+    """Return an extent [m] without noise, from extents ``again`` (draws,) with twice the variance.
+
+    It may be negative by chance. Second is the standard uncertainty of the extrapolation [m].
+    """
+    found = []
+    for power in _POWERS:
+        left = once**power - (np.mean(again**power) - once**power) / (2 ** (power / 2) - 1)
+        found.append(float(np.sign(left) * abs(left) ** (1 / power)))
+    return found[1], float(np.ptp(found)) / np.sqrt(12)
 
 
 def _extents(values: FloatArray, ends: tuple[float, float]) -> FloatArray:
@@ -292,10 +312,10 @@ class _Gaps(NamedTuple):
 
 
 def _rise(at: NDArray[np.complex128], values: FloatArray, peak: float, noise: float) -> float:
-    """Return how far a Gaussian through ``values`` (n,) [m] may exceed their ``peak``.
+    """Return how far the summit of a Gaussian through ``values`` (n,) [m] exceeds their ``peak``.
 
-    Its summit is half way to the next track at most, where it is steepest: the peak may be a ridge
-    along a track. Where the neighbouring tracks miss it, it is as wide as that allows.
+    The summit is half way to the next track at most. Where the neighbouring tracks miss it, it is
+    there, and as wide as that allows.
 
     at: places about the peak in distances of the tracks (n,);  noise: of the peak [m]
     """
@@ -308,13 +328,17 @@ def _rise(at: NDArray[np.complex128], values: FloatArray, peak: float, noise: fl
     floor = max(2 * noise, _UNSEEN * height)
     if height <= floor:
         return 0.0
+    if np.median(values[ring]) <= peak - height + floor:
+        return float(height * ((height / floor) ** _HALF_WAY**2 - 1))
     near = (away > 0) & (away < _NEXT[1])
     fall = np.log(height / np.clip(height - peak + values[near], floor, height))
     u, v = at[near].real, at[near].imag
-    a, b, c = np.linalg.lstsq(np.stack([u * u, u * v, v * v], axis=1), fall, rcond=_LEAST_SPREAD)[0]
-    # Tracks seldom meet a summit that is narrower than those that both neighbours miss.
-    curvature = np.clip((a + c + np.hypot(a - c, b)) / 2, 0.0, -np.log(_UNSEEN))
-    return float(height * np.expm1(curvature * _HALF_WAY**2))
+    columns = np.stack([u, v, u * u, u * v, v * v], axis=1)
+    *slope, a, b, c = np.linalg.lstsq(columns, fall, rcond=_LEAST_SPREAD)[0]
+    curved, ways = np.linalg.eigh([[a, b / 2], [b / 2, c]])
+    slope, curved = np.abs(ways.T @ slope), np.maximum(curved, np.finfo(np.float64).tiny)
+    way = np.minimum(slope / (2 * curved), _HALF_WAY)
+    return float(height * min(np.expm1(slope @ way - curved @ way**2), MOST_UNSEEN - 1))
 
 
 def _continued(x: FloatArray, y: FloatArray) -> FloatArray:

@@ -123,3 +123,23 @@ def test_a_pip_that_the_cells_divide_belongs_to_the_figure(seed):
     truth = 60e-9 + 20e-9
     assert abs(whole.value - truth) <= 2 * whole.uncertainty
     assert whole.uncertainty < 0.3 * truth
+
+
+def test_the_peak_to_valley_of_fine_rings_is_not_stated_too_high():
+    """10 nm of rings, seven to twelve turns of a spiral apart: thousands of points compete."""
+    turns, score = 80, []
+    way = np.sqrt(np.linspace(1e-4, 1, 20_000))
+    r, angle = R * way, 2 * np.pi * turns * way
+    x, y = r * np.cos(angle), r * np.sin(angle)
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        period, phase = rng.uniform(7, 12) * R / turns, rng.uniform(0, 2 * np.pi)
+        form = 10e-9 * np.cos(2 * np.pi * r / period + phase)
+        form += rng.normal(0, 10e-9) * (x**2 - y**2) / R**2
+        map_ = DeviationMap(x=x, y=y, deviation=form + rng.normal(0, 2e-9, len(x)),
+                            area=np.ones(len(x)), effects=np.empty((0, len(x))),
+                            noise=2e-9)  # fmt: skip
+        whole = extents_of_parts([map_], Aperture(R), Aperture(R), R / turns)[0][0]
+        score.append((whole.value - np.ptp(form)) / whole.uncertainty)
+    assert np.mean(score) < 1.3
+    assert np.sum(np.abs(score) <= 2) >= 7
