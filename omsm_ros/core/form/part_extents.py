@@ -33,7 +33,7 @@ from omsm_ros.core.form.part_figures import (
     root_of_products,
     with_and_without,
 )
-from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes, separable
+from omsm_ros.core.form.zernike_fit import ZernikeFit, continued, fit_zernikes, separable
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
@@ -72,8 +72,8 @@ _NEXT, _HALF_WAY, _AWAY, _ONE_SIDED = (0.7, 1.3), 0.5, (2.0, 3.5), 0.3
 _PEAKS, _SINGLE, _UNSEEN, _COMPANY = 6, 24, 0.05, 1 / 3
 # Most by which a summit that both neighbouring tracks miss exceeds what one track shows of it.
 MOST_UNSEEN = float(_UNSEEN ** -(_HALF_WAY**2))
-# Least singular value of a parabola through neighbours, and the weight of its curvature.
-_LEAST_SPREAD, _LEAST_CURVED = 1e-2, 0.3
+# Least singular value of a parabola through neighbours.
+_LEAST_SPREAD = 1e-2
 # Standard uncertainty of the rim's place, in distances of the tracks.
 _RIM_KNOWN = 1 / 12
 
@@ -243,7 +243,9 @@ class _Gaps(NamedTuple):
         near, rim = near[close], rim[:, close, np.newaxis]
         share = away[close, 0] * way[-1] / _PLACES / area
         strip = float(way[-1]) * spacing * _RIM_KNOWN / area
-        weights = _continued(x[near] - rim[0], y[near] - rim[1])
+        places = (x[near] - rim[0]) + 1j * (y[near] - rim[1])
+        parabola, plane = continued(places / spacing)
+        weights = np.stack([parabola, (parabola - plane) / 2])
         return cls(map_.x, map_.y, spacing, some[near], weights, share, strip)
 
     def beyond(
@@ -339,26 +341,6 @@ def _rise(at: NDArray[np.complex128], values: FloatArray, peak: float, noise: fl
     slope, curved = np.abs(ways.T @ slope), np.maximum(curved, np.finfo(np.float64).tiny)
     way = np.minimum(slope / (2 * curved), _HALF_WAY)
     return float(height * min(np.expm1(slope @ way - curved @ way**2), MOST_UNSEEN - 1))
-
-
-def _continued(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return weights (2, …, k) whose sum of values at x, y (…, k) continues them to the origin.
-
-    They continue a plane, and the curvature towards the origin where several tracks show it, from
-    the first point. The second weights are half the share of the curvature, as the next order of a
-    series is that the points do not show.
-    """
-    away = np.mean(x + 1j * y, axis=-1, keepdims=True)
-    turned = (x + 1j * y) / np.where(away == 0, 1.0, away)
-    # The least coefficients are chosen, so that curvature that one or two tracks leave open is not.
-    curved = _LEAST_CURVED * turned.real**2
-    columns = np.stack([np.ones_like(x), turned.real, turned.imag, curved], axis=-1)
-    weights = []
-    for kept in (4, 3):
-        fit = np.linalg.pinv(columns[..., :kept], rcond=_LEAST_SPREAD)
-        weights.append(fit[..., 0, :] - (columns[..., :1, :kept] @ fit)[..., 0, :])
-        weights[-1][..., 0] += 1.0
-    return np.stack([weights[0], (weights[0] - weights[1]) / 2])
 
 
 def _local_features(

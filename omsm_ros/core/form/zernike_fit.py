@@ -194,7 +194,7 @@ def _continued_to_rim(
     near = tree.query(at.T, _AROUND)[1]
     places = (u[near] - at[0, :, np.newaxis]) + 1j * (v[near] - at[1, :, np.newaxis])
     outwards = np.repeat(rim[0] - 1j * rim[1], _NODES)[:, np.newaxis]
-    shares_of = _continued(places * outwards / np.abs(outwards) / spacing)
+    shares_of = continued(places * outwards / np.abs(outwards) / spacing)
     area = np.outer(triangles * known, shares).ravel() * np.sum(points[3]) / np.sum(triangles)
     terms = zernike_values(*fit.disc.scaled(*at), fit.terms) * area
     parabola, plane = (terms @ np.sum(each * form[near], axis=1) for each in shares_of)
@@ -240,7 +240,7 @@ def _around(outline: Aperture) -> tuple[FloatArray, FloatArray]:
     return ends, rim / outline.share_of_rim(*(rim + middle))
 
 
-def _continued(places: NDArray[np.complex128]) -> FloatArray:
+def continued(places: NDArray[np.complex128]) -> FloatArray:
     """Return shares of values in the parabola and the plane through them at each node (2, q, k).
 
     places: of the values from the node (q, k). Curvature that they do not show is zero.

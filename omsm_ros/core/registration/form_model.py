@@ -65,8 +65,6 @@ _ROUNDING, _MOST_CANCELLED = 1e-12, 100.0
 LEAST_LIMIT_M = 1e-12
 # The second fit is already nearly free of dust.
 _DUST_PASSES = 3
-# Least share of a step, so that thirty steps still converge.
-_LEAST_RELAXED = 0.1
 
 # Consecutive points whose errors may be correlated.
 GROUP = 128
@@ -346,15 +344,3 @@ def best_matching_sum(columns: FloatArray, deviation: FloatArray) -> tuple[Float
         if np.array_equal(np.abs(residual) <= limit, chosen):
             break
     return fitted, limit
-
-
-def relaxation_factor(share: float, last: FloatArray, step: FloatArray) -> float:
-    """Return the share of a ``step`` (p,) to take, after ``share`` of the ``last`` one.
-
-    Where form and pose look alike a whole step overshoots, because the form follows the pose
-    (Aitken's relaxation; B. Irons, R. Tuck, Int. J. Numer. Meth. Eng. 1, 275). Steps that grow in
-    one direction are taken whole.
-    """
-    change = last - step
-    along, square = float(last @ change), float(change @ change)
-    return float(np.clip(share * along / square, _LEAST_RELAXED, 1.0)) if along > 0 else 1.0

@@ -25,7 +25,6 @@ from omsm_ros.core.registration.form_model import (
     best_matching_sum,
     estimate,
     outlier_limit,
-    relaxation_factor,
 )
 from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule, FarPoints
 from omsm_ros.core.registration.placement import (
@@ -76,7 +75,6 @@ def coarse_placement(
     at: Placement,
 ) -> Placement:
     """Return the least-squares placement without outliers, the start of the fit with form."""
-    share, last = 1.0, np.zeros(len(names))
     for turn in range(_MOST_TURNS):
         points = inside_aperture(placed(surface, at, chosen), aperture)
         if turn and len(points.x):
@@ -96,9 +94,7 @@ def coarse_placement(
             np.array([at.value(n) for n in names]) * scale,
             [typical_range(n) for n in names] * scale,
         )
-        # Points that come and go at the limit may keep the steps alternating.
-        share, last = relaxation_factor(share, last, step), step
-        at = at.moved(names, share * step / scale)
+        at = at.moved(names, step / scale)
         settled = max(SHARE_OF_SPREAD * statistics.spread(points.deviation), _SETTLED_M)
         # The joint effect counts: a tilt may cancel a shift.
         moved = float(np.sqrt(np.mean((step @ columns) ** 2)))
@@ -365,7 +361,6 @@ class _PoseFit:
 
     def refine(self, at: Placement, chosen: PointBatch) -> _PlacementState:
         """Return the converged fit; raise DataError if there is none."""
-        share, last = 1.0, np.zeros(len(self.names))
         for turn in range(_MOST_REFINED):
             points = inside_aperture(placed(self.surface, at, chosen), self.aperture)
             z = self.basis.columns(points.x, points.y)
@@ -376,20 +371,18 @@ class _PoseFit:
             none, near = np.empty((0, len(residual))), np.abs(residual) <= limit
             sums.add(columns, points.deviation, none, residual, near)
             found, _ = self.solved(at, sums)
-            own = np.sqrt(np.diag(sums.gram)[: len(self.names)] / sums.points)
-            step = found.step * own
             settled = max(SHARE_OF_SPREAD * statistics.spread(residual), LEAST_LIMIT_M)
             # The joint effect counts: a tilt may cancel a shift.
-            gram = sums.gram[: len(step), : len(step)]
+            gram = sums.gram[: len(found.step), : len(found.step)]
             square = float(found.step @ gram @ found.step) / sums.points
             still = square < settled**2 or found.length < _SHARE_OF_UNCERTAINTY
             if turn > 3 and still:
                 smooth = np.concatenate([found.step, found.form]) @ columns
                 limit = outlier_limit(points.deviation - smooth)
                 return _PlacementState(at, like, limit, found, sums)
-            share, last = relaxation_factor(share, last, step), step
             # A longer step than the deviation corrects none of it: form would have to cancel it.
-            share *= min(1.0, np.sqrt(sums.total / sums.points / square))
+            longest = sums.total / sums.points / max(square, float(np.finfo(np.float64).tiny))
+            share = min(1.0, float(np.sqrt(longest)))
             at = at.moved(self.names, share * found.step)
         raise DataError(NOT_SETTLED)
 

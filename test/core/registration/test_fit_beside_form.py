@@ -14,7 +14,6 @@ from omsm_ros.core.registration.form_model import (
     best_matching_sum,
     estimate,
     outlier_limit,
-    relaxation_factor,
 )
 from omsm_ros.core.registration.pose_parameters import (
     OpenUncertainty,
@@ -294,20 +293,6 @@ def test_pose_parameters_that_are_nearly_alike_are_solved_to_the_last_digit():
         columns @ left / 1e-18 - np.append(first.step * 1e6, first.form / first.sizes**2),
     )
     assert first._replace(step=again[:3]).length < 1e-2
-
-
-@pytest.mark.parametrize("rate", [0.5, -0.5, -1.5])
-def test_a_relaxed_step_finds_the_end_of_a_series_at_once(rate):
-    """For steps that change by a constant factor Aitken's share is 1/(1 − rate)."""
-    step = np.array([1.0, -2.0])
-    share = relaxation_factor(1.0, step, rate * step)
-    assert share == pytest.approx(min(1 / (1 - rate), 1.0))
-
-
-def test_the_first_step_is_taken_whole_and_none_less_than_a_tenth():
-    assert relaxation_factor(0.3, np.zeros(2), np.ones(2)) == 1.0
-    assert relaxation_factor(1.0, np.ones(2), np.ones(2)) == 1.0
-    assert relaxation_factor(1.0, np.ones(2), -1e9 * np.ones(2)) == 0.1
 
 
 # The budget.

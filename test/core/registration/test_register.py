@@ -121,6 +121,12 @@ def test_what_a_surface_determines_is_found(nominal, fitted_, refused):
     assert set(found.refused) == refused
 
 
+def test_points_without_any_deviation_stay_where_they_are():
+    x, y = spiral(1000)
+    found = fitted(Flat(), PointBatch(x, y, np.zeros(1000), np.empty((0, 1000))))
+    assert found.placement == Placement()
+
+
 def test_a_freedom_that_was_asked_for_in_vain_is_refused_with_the_reason():
     portion = scan(Sphere(0.1))
     with pytest.raises(
