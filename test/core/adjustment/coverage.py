@@ -51,6 +51,7 @@ AS_DRAWN = (
     *(Source(f"lag_{name}", 1e-7, evaluated=True) for name in ("motion", "x", "time", "c")),
     Source("lag_curvature", 1e-9, evaluated=True),
     Source("creep", 1e-6, evaluated=True),
+    Source("part_settling", 1e-9, evaluated=True),
 )
 
 
