@@ -149,7 +149,7 @@ def test_what_a_rejected_calibration_corrected_is_not_valid(table, true_calibrat
 
 @pytest.mark.soak
 def test_an_uncertainty_too_large_names_the_number_that_has_to_shrink(table):
-    """With the size that is named, U is the accuracy; no size reaches 1 nm."""
+    """With the size that is named, U is the accuracy or less; no size reaches 1 nm."""
     _, scans, _ = table
     rest = [p for p in PRIORS if p.name != "straightness_x"]
 
@@ -162,7 +162,8 @@ def test_an_uncertainty_too_large_names_the_number_that_has_to_shrink(table):
     assert (largest.name, largest.unit, largest.size) == ("straightness_x", "m", 90e-9)
     after, smaller = expanded(largest.allowed, 1e-9)
     assert before > 50e-9
-    np.testing.assert_allclose(after, 40e-9, rtol=0.1)
+    # What other sources may do in its place shrinks with it.
+    assert 0.8 * 40e-9 < after < 1.02 * 40e-9
     # Without the source U is the same, whatever its size was.
     np.testing.assert_allclose(largest.rest, smaller.rest, rtol=0.1)
     assert np.isnan(smaller.allowed)
