@@ -238,12 +238,6 @@ class StartingPoints:
         return poles
 
 
-def decimation(problem: Problem) -> int:
-    """Return how many samples may be one: 1 for a short record or a fast motion."""
-    per_content = np.pi / (problem.rate * problem.period) / ABOVE_CONTENT
-    return max(int(min(problem.closed_length / ENOUGH_SAMPLES, per_content)), 1)
-
-
 def coarser(problem: Problem, every: int) -> Problem:
     """Return the problem decimated to one in ``every`` samples, all signals by the same low pass.
 

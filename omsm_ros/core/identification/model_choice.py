@@ -16,8 +16,6 @@ from omsm_ros.core.estimation.model_order import (
     Candidate,
     StartingPoints,
     choose,
-    coarser,
-    decimation,
     explore,
     identifiable,
     information,
@@ -25,7 +23,7 @@ from omsm_ros.core.estimation.model_order import (
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Fit, Problem, evaluated, fit
 from omsm_ros.core.estimation.preparation import Prepared
-from omsm_ros.core.identification.residual_tests import follows_beyond, noise_colour
+from omsm_ros.core.identification.residual_tests import noise_colour
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.core.model_errors.families import FASTEST_CREEP_S
 from omsm_ros.linear_algebra import triangle
@@ -74,8 +72,6 @@ def has_initial_response(
 _MAY_BE_CHOSEN_BIC = 30.0
 # "Not worth more than a bare mention" (Kass and Raftery 1995).
 _ALIKE_BIC = 2.0
-# p-value below which content beyond the decimated bandwidth determines the model further.
-_NO_FURTHER_GAIN = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,27 +94,15 @@ def choose_model(
     budget: of the evaluations; None for a budget of its own
     order: number of poles, 0 to choose it. The free choice is made in any case.
     """
-    return _model(prepared.problem, _explored(prepared, order, budget or EvaluationBudget()), order)
-
-
-def _explored(prepared: Prepared, order: int, budget: EvaluationBudget) -> Sequence[Candidate]:
-    """Return fits of rising order; to a long record, those that fewer of its samples lead to."""
-    problem, steps = prepared.problem, prepared.steps
-    if (every := decimation(problem)) > 1:
-        coarse = coarser(problem, every)
-        moving = replace(steps, moving=steps.moving[::every])
-        fewer = _explored(replace(prepared, problem=coarse, steps=moving), order, budget)
-        found = _on_all_samples(prepared, fewer, order, budget)
-        chosen = _model(problem, found, order).chosen.fit
-        if follows_beyond(problem, chosen, coarse) > _NO_FURTHER_GAIN or budget.stops():
-            return found
+    problem, budget = prepared.problem, budget or EvaluationBudget()
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget)
     points = StartingPoints(problem, lag)
 
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
         return fit(problem, structure, points.of(structure, smaller), budget=budget)
 
-    return explore(fit_structure, order, noise_colour(problem, lag, steps), budget)
+    colour = noise_colour(problem, lag, prepared.steps)
+    return _model(problem, explore(fit_structure, order, colour, budget), order)
 
 
 def rechosen(problem: Problem, before: ChosenModel, budget: EvaluationBudget) -> ChosenModel | None:
@@ -154,24 +138,6 @@ def _model(problem: Problem, explored: Sequence[Candidate], order: int) -> Chose
         return free
     asked = [c for c in explored if c.fit.structure.poles == order]
     return ChosenModel(choose(asked), asked, free)
-
-
-def _on_all_samples(
-    prepared: Prepared, fewer: Sequence[Candidate], order: int, budget: EvaluationBudget
-) -> list[Candidate]:
-    """Return fits of ``fewer`` samples that may be chosen fitted to all, the others evaluated."""
-    problem, fits = prepared.problem, list[Fit]()
-    best = min(c.bic for c in fewer) + _MAY_BE_CHOSEN_BIC
-    for c in fewer:
-        structure, nonlinear = c.fit.structure, c.fit.nonlinear
-        may_be = c.bic < best or structure.poles == order
-        fits.append(
-            fit(problem, structure, [nonlinear], budget=budget)
-            if may_be
-            else evaluated(problem, structure, nonlinear)
-        )
-    colour = noise_colour(problem, min(fits, key=information), prepared.steps)
-    return [Candidate(each, information(each, colour)) for each in fits]
 
 
 def _identifiable(problem: Problem, candidates: Sequence[Candidate]) -> Sequence[Candidate]:

@@ -37,8 +37,6 @@ _LEAST_CROSSINGS = 50
 _LINES = 500
 # Shares of an excess that explain it, and of the noise that are worth telling.
 _MOST, _SHOWS = 0.5, 0.1
-# Width of a band, as a logarithm, and the lines in it that tell its noise.
-_BAND, _LEAST_LINES = 0.05, 20
 # Below the resolution of any probe; a misfit below it is none.
 _FINEST_READING_M = 1e-10
 # Resolves 1 Hz.
@@ -153,29 +151,6 @@ def independence(residual: FloatArray, drive: FloatArray, lags: int = _LAGS) -> 
     statistic = float(np.sum((directions.T @ moment)[kept] ** 2 / values[kept]))
     statistic /= float(np.mean(rest**2)) or 1.0
     return float(stats.chi2.sf(statistic, np.sum(kept))) if np.any(kept) else 1.0
-
-
-def follows_beyond(problem: Problem, fitted: Fit, coarse: Problem) -> float:
-    """Return the p-value that the residual does not follow motion too fast for ``coarse``.
-
-    The bands are as narrow as a lightly damped mode: unmodelled dynamics change phase within one
-    octave.
-    """
-    spectrum = problem.padded_spectrum(problem.on_grid(fitted.residual, 0.0))
-    drive = problem.s * problem.output_spectrum(fitted)
-    highest = float(np.max(np.abs(coarse.s))) if len(coarse.s) < len(problem.s) else np.inf
-    bands = np.floor(np.log(np.maximum(np.abs(problem.s) / highest, 1e-9)) / _BAND).astype(int)
-    beyond = bands >= 0
-    if not np.any(beyond):
-        return 1.0
-    place, seen, moved = bands[beyond], spectrum[beyond], drive[beyond]
-    count = np.bincount(place)
-    both = np.bincount(place, (moved.conj() * seen).real) ** 2
-    both += np.bincount(place, (moved.conj() * seen).imag) ** 2
-    power = np.bincount(place, np.abs(moved) ** 2) * np.bincount(place, np.abs(seen) ** 2)
-    tells = (count >= _LEAST_LINES) & (power > 0)
-    statistic = float(np.sum(2 * (both * count)[tells] / power[tells]))
-    return float(stats.chi2.sf(statistic, 2 * int(np.sum(tells))))
 
 
 def _correlation(a: FloatArray, b: FloatArray, lags: int) -> FloatArray:
