@@ -5,9 +5,9 @@ about one standard deviation, which no covariance shows. The chosen structure is
 with one parameter more: it trades that bias for variance, which the uncertainty band includes.
 Alternatives that changed nothing are in ``docs/design/identification-ablation.md``.
 
-A fit starts at two points, because the output error has local minima: at the best fit of a smaller
-structure, so that a larger one never fits worse, and at the result of iterated linear least
-squares, which finds resonances.
+A fit starts at several points, because the output error has local minima: at the best fit of a
+smaller structure, so that a larger one never fits worse; at the result of iterated linear least
+squares, which finds resonances; and at a simple guess, for readings too coarse for these.
 """
 
 from __future__ import annotations
@@ -165,6 +165,10 @@ def cancels(dynamics: TransferFunction) -> bool:
     return bool(np.any(apart < _CANCELLING * np.abs(poles[:, np.newaxis])))
 
 
+# Guess of the slowest pole, in units of the bandwidth of the motion.
+_GUESSED_RATE = 3.0
+# Its angle from the positive real axis [rad]: a damping ratio of 0.42.
+_GUESSED_ANGLE = 2.0
 # Part of the lag that starts as a delay where there are poles too.
 _KEPT_DELAY = 0.3
 # Iterations after Sanathanan and Koerner (1963): by then they have converged, or will not.
@@ -197,7 +201,7 @@ class StartingPoints:
         if structure.poles == 0:
             return [self.pure_delay.nonlinear]
         kept = _KEPT_DELAY * delay if structure.delay else 0.0
-        found = [scaled.nonlinear_of(self._linear(structure, kept), kept)]
+        found = [_guess(scaled, kept), scaled.nonlinear_of(self._linear(structure, kept), kept)]
         contained = [f for f in smaller if structure.contains(f.structure)]
         if contained:
             found.append(_grown(scaled, min(contained, key=lambda f: f.sum_of_squares), delay))
@@ -284,6 +288,16 @@ def _bridged(used: BoolArray, every: int) -> BoolArray:
     inside = (after > 0) & (after < len(places))
     short = apart <= max(every, int(np.median(apart)))
     return np.asarray(used[picked] | (inside & short[np.where(inside, after - 1, 0)]))
+
+
+def _guess(scaled: ScaledStructure, delay: float) -> FloatArray:
+    poles: list[complex] = []
+    for index in range(scaled.structure.pairs):
+        upper = complex((index + 1) * _GUESSED_RATE * np.exp(1j * _GUESSED_ANGLE))
+        poles += [upper, upper.conjugate()]
+    if scaled.structure.poles % 2:
+        poles.append(complex(-2.0 * _GUESSED_RATE))
+    return scaled.nonlinear_of(np.array(poles, np.complex128), delay)
 
 
 def _stable(poles: ComplexArray) -> ComplexArray:

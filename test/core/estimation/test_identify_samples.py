@@ -21,10 +21,7 @@ from omsm_ros.core.estimation.sampled_choice import (
 from omsm_ros.core.estimation.sampled_fit import SampledRecord, SectionsProblem
 from omsm_ros.core.estimation.sampled_model import free_run
 from omsm_ros.core.identification import sampled_identification
-from omsm_ros.core.identification.sampled_identification import (
-    identify_samples,
-    sampled_certificate,
-)
+from omsm_ros.core.identification.sampled_identification import identify_samples
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import ConfigurationError, IdentificationError
 
@@ -246,43 +243,50 @@ def test_poles_beyond_the_data_are_bounds():
     assert any("faster_than_hz" in p for p in poles)
 
 
-class TestVerdict:
-    def certified(self, **changed):
-        given = {
-            "order": 2,
-            "free_order": 2,
-            "widened": 1.0,
-            "valid": [(0.1, 3.0)],
-            "worse": False,
-            "entries": {
-                "predicted": 0.9,
-                "independence_p": 0.5,
-                "impulse_response": {"comparator": 0.99, "model": 0.9},
-            },
-        }
-        return sampled_certificate(**(given | changed))
+@pytest.fixture
+def certified(monkeypatch):
+    """The certificate of a good record, with one piece of evidence replaced."""
 
-    def test_good_evidence_is_accepted_within_its_range(self):
-        assert self.certified()["verdict"] == "accepted from 0.100 Hz to 3.00 Hz"
-        assert self.certified()["warnings"] == []
+    def made(worse=False, held_out=None, **replaced):
+        def chosen(*records, **options):
+            found = choose_sampled(*records, **options)
+            if held_out is not None:
+                found = replace(found, chosen=replace(found.chosen, held_out=held_out))
+            return replace(found, worse=worse)
 
-    def test_each_lack_of_evidence_is_a_reason(self):
-        lacks = {
-            "impulse response without a model for 99": {"worse": True},
-            "known nowhere": {"valid": [(0.1, 3.0), (0.1, 0.1)]},
-            "free runs over held-out parts": {"entries": {"predicted": 0.4}},
-        }
-        for says, changed in lacks.items():
-            found = self.certified(**changed)
-            assert found["verdict"] == "rejected"
-            assert says in found["reasons"][0]
+        with monkeypatch.context() as patch:
+            patch.setattr(sampled_identification, "choose_sampled", chosen)
+            for name, value in replaced.items():
+                patch.setattr(sampled_identification, name, lambda *_, value=value: value)
+            return identified(*recorded("zero-order")).certificate
 
-    def test_doubts_that_reject_nothing_are_warnings(self):
-        follows = self.certified(entries={"predicted": 0.9, "independence_p": 1e-9})
-        asked = self.certified(order=1, widened=3.0)
-        for found, says in ((follows, "follows the input"), (asked, "2 would have been")):
-            assert says in found["warnings"][0]
-            assert found["verdict"].startswith("accepted")
+    return made
+
+
+def test_good_evidence_is_accepted_within_its_range(certified):
+    found = certified(valid_range=(0.1, 3.0), _independence=0.5)
+    assert found["verdict"] == "accepted from 0.100 Hz to 3.00 Hz"
+    assert found["warnings"] == []
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"worse": True}, "impulse response without a model for"),
+        ({"valid_range": (0.1, 0.1)}, "known nowhere"),
+        ({"held_out": np.array([0.6, 0.6])}, "free runs over held-out parts"),
+    ],
+)
+def test_each_lack_of_evidence_is_a_reason(certified, changed, says):
+    found = certified(**changed)
+    assert found["verdict"] == "rejected"
+    assert says in found["reasons"][0]
+
+
+def test_a_residual_that_follows_the_input_is_a_warning_only(certified):
+    found = certified(_independence=1e-9)
+    assert "follows the input" in found["warnings"][0]
+    assert found["verdict"].startswith("accepted")
 
 
 def sines(frequencies, samples=4000):
