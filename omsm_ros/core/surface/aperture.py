@@ -28,8 +28,9 @@ _HOLDS_ALL = 0.998
 _CLEARLY = 0.02
 # Directions in which the rim of a scan may lie a track within that of the aperture.
 _AROUND = np.exp(0.25j * np.pi * np.arange(8))
-# The smallest disc about the part's origin counts if its middle is off by less than this share.
-_CENTRED = 0.25
+# The smallest disc about the part's origin counts if its middle is off by less than this share:
+# the end of a spiral of twelve turns moves it by a quarter of a track.
+_CENTRED = 0.02
 
 
 @dataclass(frozen=True, slots=True)

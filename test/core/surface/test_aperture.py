@@ -116,16 +116,20 @@ def test_an_aperture_of_the_nominal_surface_counts(text):
 
 
 def test_a_disc_off_the_origin_ends_at_its_points():
-    """A flat turned up at its rim, scanned three tracks off the axis."""
+    """A flat turned up by 200 nm at its rim, scanned on the axis, and one and three tracks off."""
     r, c = np.linspace(0, 5e-3, 4000), np.linspace(0, 100 * np.pi, 4000)
     height = 200e-9 * np.clip(r / 5e-3 - 0.8, 0, None) ** 2 / 0.04
     found = []
-    for shift in (0.0, 0.3e-3):
+    for shift in (0.0, 0.1e-3, 0.3e-3):
         batch = PointBatch(r * np.cos(c) + shift, r * np.sin(c), height, np.empty((0, len(r))))
         found.append(analyse_form(Flat(), lambda batch=batch: [batch], ("piston", "tip", "tilt")))
-    at_axis, shifted = found
     # The end of the outermost turn lies a track within the rim.
-    assert (shifted.aperture.x, shifted.aperture.radius) == pytest.approx((0.3e-3, 5e-3), abs=5e-5)
-    for name in ("rms", "peak_to_valley"):
-        one, other = at_axis.deviation[name], shifted.deviation[name]
-        assert abs(one.value - other.value) <= 2 * np.hypot(one.uncertainty, other.uncertainty)
+    assert (found[2].aperture.x, found[2].aperture.radius) == pytest.approx(
+        (0.3e-3, 5e-3), abs=5e-5
+    )
+    within = np.linspace(0, 1, 10_001)
+    true = 200e-9 * np.clip(within - 0.8, 0, None) ** 2 / 0.04
+    mean, square = (2 * np.trapezoid(within * true**power, within) for power in (1, 2))
+    for form in found:
+        for name, value in (("rms", np.sqrt(square - mean**2)), ("peak_to_valley", 200e-9)):
+            assert abs(form.deviation[name].value - value) <= 2 * form.deviation[name].uncertainty
