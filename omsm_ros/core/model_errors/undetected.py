@@ -57,6 +57,8 @@ _UNSEEN = _DECADES / 3**0.5
 # measurable. A drift of 100 nm a minute may be a relaxation of 50 s and 0.17 %; with 100 s it would
 # be twice that, and a warm machine could not be calibrated.
 _SLOWEST_CREEP_S, _MOST_RECORDS = 50.0, 10.0
+# p-value below which the uncertainty includes a mode that is not significant.
+_HINT = 0.05
 # Column of the background for the linear drift, which every fit has.
 _STEADY_DRIFT = slice(1, 2)
 
@@ -123,7 +125,8 @@ def undetected_terms(
         if judged is None or not np.isfinite(judged.score.uncertainty):
             continue
         # Steps hardly excite a mode slower than their interval.
-        if name != MODE or judged.term.parameter * diagnostics.plateau >= 1:
+        sluggish = judged.term.family == MODE and judged.term.parameter * diagnostics.plateau < 1
+        if not sluggish or _hinted_by_data(judged):
             found.append(_undetected_terms(diagnostics, judged, use))
     return found
 
@@ -212,6 +215,10 @@ def fitted_relaxation(dynamics: TransferFunction) -> float:
     return found
 
 
+def _hinted_by_data(judged: ScoreTest) -> bool:
+    return judged.term.family == MODE and judged.log_p < np.log(_HINT)
+
+
 def _undetected_terms(
     diagnostics: ResidualDiagnostics, judged: ScoreTest, use: IntendedUse
 ) -> UndetectedTerm:
@@ -220,7 +227,8 @@ def _undetected_terms(
     frequency, rms = use.frequencies_hz, use.rms_m
     collinear = _relative(fitted, frequency, shift)
     remaining = collinear - _response_error(term.family, term.parameter, term.damping, frequency)
-    whole = term.family == CREEP
+    # Fitted coefficients cannot follow the resonance of a lightly damped mode.
+    whole = term.family == CREEP or _hinted_by_data(judged)
     gain = np.concatenate([fitted.dynamics.numerator, np.zeros(len(fitted.dynamics.denominator))])
     lag = float(np.linalg.norm(remaining.imag * rms)) / use.speed_m_s
     limit = np.sqrt(stats.chi2.isf(FALSE_ALARM / term.trials, max(score.degrees, 1)))
