@@ -238,10 +238,10 @@ def _with_its_play(
         if not found[1] or half == assumed:
             break
         assumed, views = half, [replace(v, motion_play=play(v.motion, half)) for v in views]
-        wide = _fitted(*_network(scans, views, priors), views, priors)
-        if _of_play(wide[1]) < _of_play(found[1]):
+        larger = _fitted(*_network(scans, views, priors), views, priors)
+        if _of_play(larger[1]) < _of_play(found[1]):
             break
-        found = wide
+        found = larger
     return found
 
 

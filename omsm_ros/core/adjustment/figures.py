@@ -378,9 +378,9 @@ def places_of(solution: Solution, within: BoolArray | None = None) -> Places:
 def nodes_of(solution: Solution) -> Places:
     """Return two Gaussian nodes in every cell that was scanned.
 
-    Over the centres of the blocks terms of high degree are not orthogonal to the reported ones. Of
-    a cell that was scanned in part, which lies at an end of a ring or has its blocks off the middle
-    of it, the centre of the blocks.
+    Over the centres of the blocks terms of high degree are not orthogonal to the reported ones. A
+    cell that was scanned in part, at an end of a ring or with its blocks off the middle, has the
+    centre of the blocks instead.
     """
     part, centres = solution.network.part, places_of(solution)
     inside = centres.area > 0

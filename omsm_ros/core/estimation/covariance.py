@@ -70,7 +70,7 @@ def leverage_of(basis: FloatArray, length: int) -> FloatArray:
     basis: (r, n), orthonormal rows that span the columns of the fit
 
     A fit has its parameters where the inputs have power, which is often where coloured noise is
-    strong. There its residual has less noise than elsewhere: one factor for all frequencies, of the
+    strong. Its residual has less noise there than elsewhere: one factor for all frequencies, by the
     degrees of freedom, would understate it (as the leverage of MacKinnon and White 1985 does in
     time).
     """

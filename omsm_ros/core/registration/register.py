@@ -340,7 +340,7 @@ class _PoseFit:
         together = float(np.mean(sums.scores[free:] / own)) / variance if variance > 0 else 1.0
         square = sums.gram[:, : sums.columns]
         moments = sums.gram[:, sums.columns]
-        # What a step of the pose alone corrects does not show how large the form is.
+        # Deviations that a step of the pose corrects do not show how large the form is.
         scale = np.sqrt(np.diag(square)[:free])
         pose, right = square[:free, :free] / np.outer(scale, scale), moments[:free] / scale
         left = sums.total - float(right @ np.linalg.lstsq(pose, right, rcond=1e-12)[0])

@@ -162,7 +162,7 @@ def test_an_uncertainty_too_large_names_the_number_that_has_to_shrink(table):
     assert (largest.name, largest.unit, largest.size) == ("straightness_x", "m", 90e-9)
     after, smaller = expanded(largest.allowed, 1e-9)
     assert before > 50e-9
-    # What other sources may do in its place shrinks with it.
+    # The effect of other sources in its place shrinks with it.
     assert 0.8 * 40e-9 < after < 1.02 * 40e-9
     # Without the source U is the same, whatever its size was.
     np.testing.assert_allclose(largest.rest, smaller.rest, rtol=0.1)

@@ -210,7 +210,7 @@ def spiral_of(turns, seen=lambda place: np.full(len(place), True)):
 
 @pytest.mark.parametrize("turns", [42, 127])
 def test_terms_that_are_not_fitted_leave_the_reported_ones_alone(turns):
-    """Of terms of degree 9 to 14 less than a hundredth passes; over centres of blocks 9 %."""
+    """Less than a hundredth of terms of degree 9 to 14 passes; over centres of blocks 9 %."""
     solution = spiral_of(turns)
     nodes = nodes_of(solution)
     every, fit = _term_fit(solution, nodes)

@@ -233,7 +233,7 @@ def test_an_error_of_the_direction_without_a_width_is_named_alone():
 
 
 def test_a_creep_over_many_seconds_is_a_creep():
-    """Of 8 s, of which the step test shows nothing."""
+    """Its time constant is 8 s, of which the step test shows nothing."""
     _, made = drawn(0, 2, slow_creep=3e-4)
     found = adjust(made, AS_DRAWN, nominal=MIRROR, accuracy=25e-9)
     assert "creep" in named(found)[0]

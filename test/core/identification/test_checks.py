@@ -83,7 +83,7 @@ def evidence(
 
 @pytest.fixture(autouse=True)
 def computed(monkeypatch):
-    """What is computed from a fit is stated instead."""
+    """Stated numbers stand for those computed from a fit."""
     monkeypatch.setattr(checks, "gain_uncertainty_alone", lambda problem, fit: fit.uncertain)
     monkeypatch.setattr(checks, "inter_sample_delay_bound", lambda bound, steps, period: bound)
     monkeypatch.setattr(checks, "accuracy_on", lambda stated: stated.reached)
