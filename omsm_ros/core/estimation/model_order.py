@@ -175,7 +175,7 @@ _KEPT_DELAY = 0.3
 _LINEAR_ITERATIONS = 8
 # Start of an added pole: fast enough to change little, slow enough to have a gradient.
 _ADDED_POLE = -10.0
-# A record of twice as many samples is decimated first; a step test at 1 kHz has 20 000.
+# Slow model errors thin records of twice as many samples; a step test at 1 kHz has 20 000.
 ENOUGH_SAMPLES = 20_000
 # Half the sampling rate of a decimated problem over the bandwidth of the motion.
 ABOVE_CONTENT = 1.25
