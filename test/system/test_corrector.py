@@ -140,8 +140,8 @@ def test_an_overridden_calibration_marks_every_cloud_by_its_frame(cell, true_cal
     assert feed.answer(*blocks(first=10_000)).header.frame_id == "workpiece"
     # Counts survive a new calibration.
     value = cell.operator.value
-    cell.wait("the counts", lambda: value("corrector", "axes_received") == 3 * COUNT)
-    assert value("corrector", "clouds_published") == 3
+    cell.wait("the counts", lambda: value("corrector", "clouds_published") == 3)
+    assert value("corrector", "axes_received") == 3 * COUNT
     cell.wait("no warning", lambda: cell.operator.text("corrector", "message") == "correcting")
 
 
