@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import signal
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.streams.blocks import FloatArray
 
@@ -48,7 +48,7 @@ def check_path(
     output = -(distance / static_gain)
     before = _centred(z - output)
     after = _centred(predicted - output)
-    turning = signal.hilbert(_centred(z))
+    turning = scipy.signal.hilbert(_centred(z))
     phase = np.unwrap(np.angle(turning))
     return PathCheck(
         frequency=np.gradient(phase) / (2 * np.pi * sample_period),
@@ -67,7 +67,7 @@ def excited_bands(z: FloatArray, sample_period: float) -> tuple[tuple[float, flo
 
     Elsewhere the instantaneous frequency of a noisy motion strays, and there is no result.
     """
-    power = abs(np.fft.rfft(_centred(z) * signal.windows.tukey(len(z), _TAPERED))) ** 2
+    power = abs(np.fft.rfft(_centred(z) * scipy.signal.windows.tukey(len(z), _TAPERED))) ** 2
     band = np.floor(np.arange(len(power)) / (len(z) * sample_period)).astype(np.int64)
     in_band = np.bincount(band, power)
     excited = np.flatnonzero(in_band > _EXCITED * in_band.max())
@@ -79,5 +79,5 @@ def _centred(values: FloatArray) -> FloatArray:
 
 
 def _lag(ahead: FloatArray, behind: FloatArray) -> FloatArray:
-    ratio = signal.hilbert(_centred(ahead)) * np.conj(signal.hilbert(_centred(behind)))
+    ratio = scipy.signal.hilbert(_centred(ahead)) * np.conj(scipy.signal.hilbert(_centred(behind)))
     return np.asarray(np.angle(ratio))

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 from numpy.polynomial import Legendre
-from scipy import fft
 
 from omsm_ros.core.streams.blocks import (
     SAME_PERIOD,
@@ -140,7 +140,7 @@ def content_frequency(z: FloatArray, sample_period: float) -> float:
     """
     velocity = np.diff(z)
     if len(velocity) > _LONG:
-        velocity = velocity[: fft.prev_fast_len(len(velocity), real=True)]
+        velocity = velocity[: scipy.fft.prev_fast_len(len(velocity), real=True)]
     along = np.linspace(-1.0, 1.0, len(velocity))
     slow = (
         np.asarray(Legendre.fit(along, velocity, degree)(along), np.float64)

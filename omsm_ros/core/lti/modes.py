@@ -14,9 +14,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 from numpy.polynomial import polynomial
 from numpy.typing import ArrayLike
-from scipy import optimize, signal
 
 from omsm_ros.core.lti.frequency_response import relative_response_jacobian, spread_along
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
@@ -262,13 +262,13 @@ def fit_two_mass(
 
 def _least(
     residual: Callable[[FloatArray], FloatArray], starts: Sequence[FloatArray]
-) -> optimize.OptimizeResult:
+) -> "scipy.optimize.OptimizeResult":
     """Minimise the sum of squares from all ``starts`` briefly, then from the best to the end."""
 
-    def descend(start: FloatArray, evaluations: int | None) -> optimize.OptimizeResult:
+    def descend(start: FloatArray, evaluations: int | None) -> "scipy.optimize.OptimizeResult":
         box = (start - _SEARCHED, start + _SEARCHED)
         # Central differences, because the weights span a factor of 10⁴.
-        return optimize.least_squares(
+        return scipy.optimize.least_squares(
             residual, start, jac="3-point", x_scale="jac", bounds=box, max_nfev=evaluations
         )
 
@@ -331,5 +331,5 @@ def response_features(dynamics: TransferFunction, up_to: float) -> dict[str, flo
 
 
 def _highest_peak(values: FloatArray) -> int | None:
-    peaks, _ = signal.find_peaks(values, prominence=_LEAST_PROMINENCE)
+    peaks, _ = scipy.signal.find_peaks(values, prominence=_LEAST_PROMINENCE)
     return int(peaks[np.argmax(values[peaks])]) if len(peaks) else None
