@@ -15,9 +15,10 @@ from omsm_ros.twin.cell import blocks_of
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, step_test, small_scan_blocks, true_calibration):
-    """Two bags, a calibration and a nominal surface."""
+    """Three bags, a calibration and a nominal surface; the short scan has two and a half turns."""
     folder = tmp_path_factory.mktemp("cell")
-    for name, blocks in (("steps", blocks_of(step_test)), ("scan", small_scan_blocks)):
+    scans = (("scan", small_scan_blocks), ("short", small_scan_blocks[:50]))
+    for name, blocks in (("steps", blocks_of(step_test)), *scans):
         with BagWriter(folder / f"{name}.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
             for axes, distance in blocks:
                 bag.write_block(axes)
@@ -90,7 +91,7 @@ def test_a_scan_of_which_nothing_can_be_corrected_is_reported(
 
 
 def test_correct_registers_the_part_in_its_pass(capsys, folder, tmp_path):
-    arguments = ["correct", folder / "scan.mcap", "--calibration", folder / "cal.json",
+    arguments = ["correct", folder / "short.mcap", "--calibration", folder / "cal.json",
                  "--out", tmp_path, "--nominal", folder / "mirror.yaml", "--fit", "piston,tip,tilt",
                  "--json"]  # fmt: skip
     status, text, _ = run(capsys, *arguments, "--no-report")
@@ -106,10 +107,10 @@ def test_correct_registers_the_part_in_its_pass(capsys, folder, tmp_path):
 
 
 def test_the_page_of_a_scan_names_the_scan(capsys, folder, tmp_path):
-    words = ["form", folder / "scan.mcap", "--calibration", folder / "cal.json", "--nominal",
+    words = ["form", folder / "short.mcap", "--calibration", folder / "cal.json", "--nominal",
              folder / "mirror.yaml", "--fit", "piston,tip,tilt"]  # fmt: skip
     assert run(capsys, *words, "--out", tmp_path)[0] == 0
-    assert "<title>Form of scan.mcap</title>" in (tmp_path / "report.html").read_text()
+    assert "<title>Form of short.mcap</title>" in (tmp_path / "report.html").read_text()
 
 
 def test_a_fit_needs_a_surface(capsys, folder, tmp_path):
@@ -155,7 +156,7 @@ def test_every_command_speaks_to_people_too(capsys, folder, tmp_path, command):
     arguments = {
         "identify": [folder / "steps.mcap", "--out", tmp_path / "c.json", "--order", 2],
         "correct": [
-            folder / "scan.mcap",
+            folder / "short.mcap",
             "--calibration",
             folder / "cal.json",
             "--out",

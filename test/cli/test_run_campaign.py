@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import replace
 from itertools import islice
+from unittest import mock
 
 import pytest
 
@@ -24,10 +25,10 @@ OPTIONS = ("--no-report",)
 
 @pytest.fixture(scope="module")
 def shop(tmp_path_factory, small_scan_blocks, true_calibration):
-    """Two good bags, one of them in a folder, one that is damaged, and a calibration."""
+    """Three good bags, one of them in a folder, one that is damaged, and a calibration."""
     folder = tmp_path_factory.mktemp("shop")
     (folder / "bags" / "monday").mkdir(parents=True)
-    for name in ("a", "monday/c"):
+    for name in ("a", "b", "monday/c"):
         with BagWriter(
             folder / "bags" / f"{name}.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
         ) as bag:
@@ -44,9 +45,16 @@ def shop(tmp_path_factory, small_scan_blocks, true_calibration):
 
 @pytest.fixture(scope="module")
 def finished(shop, tmp_path_factory):
-    """A campaign over the shop, and its entries."""
-    folder = tmp_path_factory.mktemp("finished")
-    return folder, run_campaign(shop / "bags", shop / "cal.json", folder, OPTIONS, jobs=2)
+    """A campaign over the shop, and its entries; the process of one bag is killed."""
+    folder, run = tmp_path_factory.mktemp("finished"), subprocess.run
+
+    def sometimes_killed(command, **options):
+        if any("b.mcap" in part for part in command):
+            command = [sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"]
+        return run(command, **options)
+
+    with mock.patch.object(campaign.subprocess, "run", sometimes_killed):
+        return folder, run_campaign(shop / "bags", shop / "cal.json", folder, OPTIONS, jobs=2)
 
 
 def states(entries):
@@ -55,7 +63,10 @@ def states(entries):
 
 def test_every_bag_becomes_a_result_or_a_reason(shop, finished, tmp_path):
     folder, entries = finished
-    assert states(entries) == {"a.mcap": DONE, "monday/c.mcap": DONE, "torn.mcap": REFUSED}
+    assert states(entries) == {
+        "a.mcap": DONE, "b.mcap": CRASHED, "monday/c.mcap": DONE, "torn.mcap": REFUSED,
+    }  # fmt: skip
+    assert "SIGKILL" in entries[1].said
     assert "torn.mcap" in entries[-1].said
     assert load_campaign(folder) == entries
     alone = tmp_path / "alone"
@@ -78,28 +89,14 @@ def test_what_is_done_is_not_done_again(shop, finished, tmp_path, monkeypatch):
 
     monkeypatch.setattr(campaign, "correct_one", note)
     run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS)
-    assert started == ["torn.mcap"]
+    assert started == ["b.mcap", "torn.mcap"]
     started.clear()
     (tmp_path / "a" / "summary.json").unlink()
     run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS)
-    assert sorted(started) == ["a.mcap", "torn.mcap"]
+    assert sorted(started) == ["a.mcap", "b.mcap", "torn.mcap"]
     started.clear()
     run_campaign(shop / "bags", shop / "cal.json", tmp_path, (*OPTIONS, "--probe-latency", "1e-4"))
-    assert len(started) == 3
-
-
-def test_a_killed_process_costs_its_bag_and_no_other(shop, tmp_path, monkeypatch):
-    run = subprocess.run
-
-    def sometimes_killed(command, **options):
-        if any("b.mcap" in part for part in command):
-            command = [sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"]
-        return run(command, **options)
-
-    monkeypatch.setattr(campaign.subprocess, "run", sometimes_killed)
-    entries = run_campaign(shop / "few", shop / "cal.json", tmp_path, OPTIONS, jobs=2)
-    assert states(entries) == {"a.mcap": DONE, "b.mcap": CRASHED, "torn.mcap": REFUSED}
-    assert "SIGKILL" in entries[1].said
+    assert len(started) == 4
 
 
 def test_a_bag_with_which_every_worker_died_costs_no_other(shop, tmp_path, monkeypatch):
@@ -118,7 +115,7 @@ def test_a_bag_with_which_every_worker_died_costs_no_other(shop, tmp_path, monke
     assert [(e.bag, e.said) for e in entries if e.state == CRASHED] == [
         ("a.mcap", "no worker finished it (KilledWorker)")
     ]
-    assert len(entries) == 3
+    assert len(entries) == 4
     assert load_campaign(tmp_path) == entries
 
 
@@ -197,4 +194,4 @@ def test_two_dask_workers_give_the_same_though_one_is_killed(shop, tmp_path):
             scheduler=cluster.scheduler_address, progress=kill_once,
         )  # fmt: skip
     assert killed
-    assert sorted(states(entries).values()) == [DONE, DONE, REFUSED]
+    assert sorted(states(entries).values()) == [DONE, DONE, DONE, REFUSED]

@@ -15,7 +15,7 @@ from omsm_ros.twin.machine_errors import MachineErrors
 from omsm_ros.twin.part import PartPose
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of
 
-SCENARIO = Scenario(seed=3, start_radius=5e-3, feed_per_turn=2.5e-4)
+SCENARIO = Scenario(seed=3, start_radius=3e-3, feed_per_turn=2.5e-4)
 STATED = """\
 schema: omsm-sources/1
 sources:
@@ -47,10 +47,6 @@ def shop(tmp_path_factory):
     write_recording(folder / "scan.mcap", scan)
     wrapped = np.mod(scan.axes.c + np.pi, 2 * np.pi) - np.pi
     write_recording(folder / "wrapped.mcap", replace(scan, axes=replace(scan.axes, c=wrapped)))
-    pose = PartPose(x_m=5e-5, y_m=-3e-5, z_m=2e-6, tilt_x_rad=1e-3, tilt_y_rad=-5e-4,
-                    clocking_rad=3e-3)  # fmt: skip
-    posed = Disturbances(machine=MachineErrors(pose=pose))
-    write_recording(folder / "posed.mcap", scan_of(SCENARIO, posed))
     write_nominal(folder / "mirror.yaml")
     (folder / "stated.yaml").write_text(STATED, encoding="utf-8")
     zeros = [
@@ -104,6 +100,10 @@ def test_verdict_and_form_agree_whatever_is_fitted(capsys, shop):
 
 @pytest.mark.soak
 def test_a_part_in_any_pose_has_the_figure_of_the_part(capsys, shop):
+    pose = PartPose(x_m=5e-5, y_m=-3e-5, z_m=2e-6, tilt_x_rad=1e-3, tilt_y_rad=-5e-4,
+                    clocking_rad=3e-3)  # fmt: skip
+    posed = Disturbances(machine=MachineErrors(pose=pose))
+    write_recording(shop / "posed.mcap", scan_of(SCENARIO, posed))
     words = ("--sources", shop / "stated.yaml", "--fit", "auto")
     found = {n: correct(capsys, shop, f"{n}.mcap", *words)["figures"] for n in ("scan", "posed")}
     one, other = (found[n]["peak_to_valley"] for n in ("scan", "posed"))

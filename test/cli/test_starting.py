@@ -101,7 +101,7 @@ def test_the_twin_without_faults_is_safe_to_scan(capsys, tmp_path):
 
 @pytest.mark.parametrize("redirected", ["2>/dev/full", *soaked(">&- 2>&-", "2>&-")])
 def test_the_exit_status_is_right_without_a_readable_stderr(redirected, tmp_path):
-    command = f"{sys.executable} -m omsm_ros.cli compare none.json none.json {redirected}"
+    command = f"{sys.executable} -m omsm_ros.cli inspect none.mcap {redirected}"
     done = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (2, b"", b"")
 

@@ -12,6 +12,7 @@ import os
 from omsm_ros import cli
 assert cli.main(["correct", "no.mcap", "--calibration", "none.json", "--out", "nowhere"]) == 2
 import numpy as np
+import scipy.linalg
 np.vdot(np.ones(1_000_000), np.ones(1_000_000))
 print(len(os.listdir("/proc/self/task")), os.environ["OMP_NUM_THREADS"])
 """

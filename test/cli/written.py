@@ -1,8 +1,10 @@
 """Write recordings as bags, and read the facts that a command prints."""
 
 import json
+from unittest import mock
 
 from omsm_ros import cli
+from omsm_ros.cli import command_line
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.twin.cell import blocks_of
@@ -19,8 +21,11 @@ def write(path, recording):
 
 
 def facts(capsys, *arguments):
-    assert cli.main([*map(str, arguments), "--json"]) == 0
+    """Run a command; return its JSON. What it found is also printed as text for people."""
+    with mock.patch.object(command_line, "_tell", wraps=command_line._tell) as tell:
+        assert cli.main([*map(str, arguments), "--json"]) == 0
     machine = json.loads(capsys.readouterr().out)
-    assert cli.main([*map(str, arguments)]) == 0
+    args, found = tell.call_args.args
+    args.run.show(found)
     assert capsys.readouterr().out.strip()
     return machine
