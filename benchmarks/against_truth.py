@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,11 +55,11 @@ def mass_errors(found: Sequence[Calibration], truth: TwoMass, *, collocated: boo
     exact = np.log([getattr(truth, name) / truth.m1 for name in FITTED])
     stated, noise = [], []
     for calibration in found:
-        certificate: Any = calibration.certificate
+        certificate = calibration.certificate
         entry = certificate.response.two_mass
-        if entry is None or entry["collocated"] is not collocated:
+        if entry is None or entry.collocated is not collocated:
             continue
-        model, relative = entry["model"], entry["relative_uncertainty"]
+        model, relative = entry.model, entry.relative_uncertainty
         off = np.log([model[name] / model["m1"] for name in FITTED]) - exact
         stated.append(off / [relative[name] for name in FITTED])
         size = len(calibration.covariance)
