@@ -158,12 +158,12 @@ def noise_floor(power: FloatArray, oversampling: int = 1) -> FloatArray:
     centres = np.unique(np.geomspace(1, count, _BANDS).astype(np.int64)) - 1
     even = np.arange(0, count, max(broad // 2, 1))
     centres = np.unique(np.r_[0, centres, even, count - 1])
+    half = np.clip(_RELATIVE_WIDTH * centres, narrow, broad).astype(np.int64)
+    low, high = np.maximum(centres - half, 0), np.minimum(centres + half + 1, count)
     level = np.empty(len(centres))
-    for place, centre in enumerate(centres):
-        half = int(np.clip(_RELATIVE_WIDTH * centre, narrow, broad))
-        low, high = max(centre - half, 0), min(centre + half + 1, count)
-        middle = (high - low - 1) // 2, (high - low) // 2
-        ordered = np.partition(power[low:high], middle)  # np.median takes longer to check its input
+    for place, (first, end) in enumerate(zip(low, high, strict=True)):
+        middle = (end - first - 1) // 2, (end - first) // 2
+        ordered = np.partition(power[first:end], middle)  # np.median checks it for longer
         level[place] = (ordered[middle[0]] + ordered[middle[1]]) / 2
     tiny = np.finfo(float).tiny
     logs = np.interp(np.arange(count), centres, np.log(np.maximum(level, tiny)))

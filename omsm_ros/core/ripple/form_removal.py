@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import TypeAlias
 
 import numpy as np
@@ -95,6 +95,9 @@ class FormFit:
         self._height = signal.height - np.mean(signal.height)
         every = max(len(signal) // _MOST_FITTED, 1)
         self._chosen = np.arange(0, len(signal), every)
+        drawn = np.random.default_rng(0).permutation(len(self._chosen))[:_CHUNK]
+        self._some = self._chosen[np.sort(drawn)]
+        self._orthogonal = cache(partial(_orthogonal, signal, self._some))
         self._degree = self._sufficient_degree(self._height, _WORTH)
 
     @property
@@ -105,19 +108,11 @@ class FormFit:
         """Return the highest degree that is worth all degrees up to it.
 
         A form with six lobes, for example, needs the sixth degree although the fourth removes
-        nothing. The columns are made orthogonal, lowest degree first.
+        nothing. Degrees above the usual one are computed where the usual one is worth it.
         """
-        drawn = np.random.default_rng(0).permutation(len(self._chosen))[:_CHUNK]
-        some = self._chosen[np.sort(drawn)]
-        basis = _Basis.of(self._signal)
-        own = np.array([basis.degree(name) for name in basis.names])
-        order = np.argsort(own, kind="stable")
-        columns = basis.columns(self._signal, some)[:, order]
-        columns /= np.linalg.norm(columns, axis=0)
-        free = abs(np.diag(np.linalg.qr(columns, "r"))) > _LEAST_DETERMINED**0.5
-        rows, own = np.linalg.qr(columns[:, free])[0], own[order][free]
-        residual, degree, left = values[some], 0, np.inf
+        residual, degree, left = values[self._some], 0, np.inf
         for higher in _DEGREES:
+            rows, own = self._orthogonal(higher > _USUAL_DEGREE)
             part = rows[:, own <= higher]
             residual = residual - part @ (part.T @ residual)
             now = float(residual @ residual)
@@ -136,18 +131,16 @@ class FormFit:
         """Remove form, drift and orders, fitted together with ``waves``, which are kept."""
         basis, signal, chosen = self._basis, self._signal, self._chosen
         own = len(basis.names)
-        gram, moment = _normal_equations(basis, signal, self._height, chosen, waves)
-        inverse = _inverse(gram)
-        solution = np.zeros(len(gram))
-        residual = self._height
+        bare, solution = self._height, np.zeros(1)
         for _ in range(2):  # the second pass removes rounding errors of millimetres
-            solution += inverse @ moment
+            gram, moment = _normal_equations(basis, signal, bare, chosen, waves)
+            inverse = _inverse(gram)
+            solution = solution + inverse @ moment
             form = partial(basis.columns, signal)
             residual = self._height - _evaluated(form, len(signal), solution[:own])
             bare = residual
             if waves is not None:
                 bare = residual - _evaluated(waves, len(signal), solution[own:])
-            _, moment = _normal_equations(basis, signal, bare, chosen, waves)
         variance = float(np.mean(bare[chosen] ** 2))
         spread = np.sqrt(np.maximum(np.diag(inverse)[:own], 0.0) * variance)
         return FormRemoved(
@@ -217,16 +210,28 @@ class _Basis:
         time = 2 * signal.sample[chosen] / max(int(signal.sample[-1]), 1) - 1
         rho, angle = signal.radius[chosen] / self.largest, 2 * np.pi * signal.turn[chosen]
         turns = np.vander(np.exp(1j * angle), HIGHEST_ORDER + 1, increasing=True).T
-        found = np.empty((len(chosen), len(self.names)))
+        found = np.empty((len(self.names), len(chosen)))
         for place, (kind, n, m) in enumerate(self.names):
             if kind == "drift":
-                found[:, place] = legendre.legval(time, [0.0] * n + [1.0])
+                found[place] = legendre.legval(time, [0.0] * n + [1.0])
             elif kind == "order":
-                found[:, place] = turns[m].real if m >= 0 else turns[-m].imag
+                found[place] = turns[m].real if m >= 0 else turns[-m].imag
         form = [place for place, name in enumerate(self.names) if name[0] == "form"]
         terms = [ZernikeIndex(*self.names[place][1:]) for place in form]
-        found[:, form] = zernike_values(rho * turns[1].real, rho * turns[1].imag, terms).T
-        return found
+        found[form] = zernike_values(rho * turns[1].real, rho * turns[1].imag, terms)
+        return found.T
+
+
+def _orthogonal(signal: ScanSignal, some: np.ndarray, every: bool) -> tuple[FloatArray, np.ndarray]:
+    """Return orthogonal columns (m, p) of usual degrees, or of ``every`` one, and their degrees."""
+    basis = _Basis.of(signal).up_to(_DEGREES[-1] if every else _USUAL_DEGREE)
+    own = np.array([basis.degree(name) for name in basis.names])
+    order = np.argsort(own, kind="stable")
+    columns = basis.columns(signal, some)[:, order]
+    columns /= np.linalg.norm(columns, axis=0)
+    rows, upper = np.linalg.qr(columns)
+    free = abs(np.diag(upper)) > _LEAST_DETERMINED**0.5
+    return rows if free.all() else np.linalg.qr(columns[:, free])[0], own[order][free]
 
 
 def _normal_equations(
@@ -236,16 +241,14 @@ def _normal_equations(
     chosen: np.ndarray,
     waves: Waves | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    gram, moment = np.zeros((0, 0)), np.zeros(0)
+    products = []
     for first in range(0, len(chosen), _CHUNK):
         part = chosen[first : first + _CHUNK]
         columns = basis.columns(signal, part)
         if waves is not None:
             columns = np.hstack([columns, waves(part)])
-        if not len(gram):
-            gram, moment = np.zeros((columns.shape[1],) * 2), np.zeros(columns.shape[1])
-        gram += columns.T @ columns
-        moment += columns.T @ values[part]
+        products.append((columns.T @ columns, columns.T @ values[part]))
+    gram, moment = (np.sum(parts, axis=0) for parts in zip(*products, strict=True))
     return gram, moment
 
 

@@ -88,11 +88,7 @@ def find_lines(
     coordinates = coordinates_of(signal)
     searched = [c for c in coordinates.values() if c.like == c.name]
     reserved = _reserved(coordinates, reserved_orders)
-    lines = (
-        _outside_reserved(fitted(list(known), coordinates, values), coordinates, reserved)
-        if known
-        else []
-    )
+    lines = _outside_reserved(fitted(list(known), coordinates, values), coordinates, reserved)
     residual = values - sum_of(lines, coordinates, len(values))
     taken = {name: list(places) for name, places in reserved.items()}
     for line in removed:
@@ -129,7 +125,7 @@ def further_lines(
         residual = new.residual
         for k, group in enumerate(groups):
             values = residual + sum_of(group, coordinates, len(residual))
-            groups[k] = fitted(group, coordinates, values) if group else group
+            groups[k] = fitted(group, coordinates, values)
             residual = values - sum_of(groups[k], coordinates, len(residual))
         spectrum = _judged(signal, [*chain(*groups)], coordinates, residual)
     return spectrum

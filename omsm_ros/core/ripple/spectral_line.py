@@ -74,6 +74,8 @@ def fitted(
     lines: list[SpectralLine], coordinates: dict[str, Coordinate], values: FloatArray
 ) -> list[SpectralLine]:
     """Fit all ``lines`` together to ``values`` (n,): amplitudes first, then frequencies as well."""
+    if not lines:
+        return []
     lines = _stepped(lines, coordinates, values, turning=False)
     for _ in range(_FITTING_STEPS):
         lines = _apart(_stepped(lines, coordinates, values, turning=True), coordinates)
@@ -90,18 +92,17 @@ def in_their_coordinates(
 
     Where the pace hardly changes, the grid of a spectrum may favour the wrong coordinate.
     """
-    names = {(line.coordinate, round(line.frequency / _bin(line, coordinates))) for line in new}
-    chosen = []
+
+    def place(line: SpectralLine) -> tuple[str, int]:
+        return line.coordinate, round(line.frequency / coordinates[line.coordinate].resolution / 4)
+
+    places, chosen = {place(line) for line in new}, []
     for line in lines:
-        if (line.coordinate, round(line.frequency / _bin(line, coordinates))) in names:
+        if place(line) in places:
             whole = residual + sum_of([line], coordinates, len(residual))
             line = _best_version(line, coordinates, whole)
         chosen.append(line)
     return chosen
-
-
-def _bin(line: SpectralLine, coordinates: dict[str, Coordinate]) -> float:
-    return 4 * coordinates[line.coordinate].resolution
 
 
 def _best_version(
