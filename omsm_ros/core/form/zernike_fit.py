@@ -310,8 +310,9 @@ def _scores(
 
     Groups are passes of the path. Where the path resolves form that the terms do not describe, the
     sums over passes vary smoothly, and their fourth differences show the errors alone (systematic
-    samples: K. Wolter, Introduction to Variance Estimation, 2007, ch. 8). Without passes, groups
-    are successive points with correlated errors.
+    samples: K. Wolter, Introduction to Variance Estimation, 2007, ch. 8). The first and the last
+    passes, which determine the form at the rim, are in few of them; single points show the rest.
+    Without passes, groups are successive points with correlated errors.
 
     inverse: of the Gram matrix (k, k). The fit follows the errors of each group in part; the
     residuals are therefore those from the fit to all other groups (delete-a-group jackknife;
@@ -322,7 +323,12 @@ def _scores(
         size = _GROUP if len(x) >= _GROUP * _LEAST_GROUPS * len(terms) else 1
         begins, differences = np.arange(0, len(x), size), 0
     ends = np.append(begins[1:], len(x))
-    sums, single = np.empty((len(terms), len(begins))), np.zeros((len(terms), len(terms)))
+    sums, (single, missed) = np.empty((len(terms), len(begins))), np.zeros((2, *inverse.shape))
+    squares = np.array([comb(differences, k) for k in range(differences + 1)]) ** 2 / comb(
+        2 * differences, differences
+    )
+    # Share of the square of each sum that the differences contain.
+    shown = np.convolve(np.ones(len(begins) - differences), squares)
     first = 0
     while first < len(begins):
         # A portion holds as many whole groups as fit the cache.
@@ -338,14 +344,28 @@ def _scores(
         alone = weighted * rough
         single += alone @ alone.T
         sizes = ends[groups] - begins[groups]
+        if np.any(shown[groups] < 1):
+            missed += alone * np.repeat(1 - shown[groups], sizes) @ alone.T
         sums[:, groups] = _group_sums(products, columns, weighted, inverse, sizes)
         first = last
     scatter = np.diff(sums, differences, axis=1) / np.sqrt(comb(2 * differences, differences))
-    count = max(scatter.shape[1], 2)
-    # The sum over all groups is zero, so that without differences one group is not independent.
-    free = count if differences else count - 1
+    scatter = _over_groups(scatter, single - missed, differences) + missed
     dof = max(1 - len(terms) / len(x), 1e-3)
-    return scatter @ scatter.T * len(begins) / free / dof, single / dof
+    return scatter / dof, single / dof
+
+
+def _over_groups(sums: FloatArray, alone: FloatArray, differences: int) -> FloatArray:
+    """Return the sum of products (k, k) of the ``differences`` of sums over groups (k, g).
+
+    alone: the same of single points. Errors beyond these are in the first and last groups, too.
+    """
+    count, scatter = sums.shape[1], sums @ sums.T
+    if not differences:  # The sum over all groups is zero, so that one group is not independent.
+        return np.asarray(scatter * count / max(count - 1, 1))
+    own = np.diag(scatter)
+    beyond = np.maximum(own - np.diag(alone), 0.0) / np.where(own > 0, own, np.inf)
+    more = np.sqrt(1 + differences / count * beyond)
+    return np.asarray(scatter * np.outer(more, more))
 
 
 def _group_sums(

@@ -6,7 +6,12 @@ import pytest
 from omsm_ros.core.form.zernike_fit import fit_zernikes
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.area_weights import area_weights
-from omsm_ros.core.surface.zernike_terms import ZernikeIndex, first_terms, zernike_values
+from omsm_ros.core.surface.zernike_terms import (
+    ZernikeIndex,
+    first_terms,
+    terms_up_to,
+    zernike_values,
+)
 from omsm_ros.errors import DataError
 
 DISC, TERMS = Aperture(12.7e-3, 1e-4, -2e-4), first_terms(37)
@@ -58,6 +63,29 @@ def test_on_a_spiral_the_stated_variance_is_not_too_small():
     assert 0.98 < np.mean(stated) < 1.3
     symmetric = [k for k, term in enumerate(TERMS) if term.m == 0]
     assert np.mean(np.array(stated)[:, symmetric]) > 0.93
+
+
+def test_the_height_at_the_rim_of_a_spiral_scatters_as_stated():
+    """Half of the noise there is that of two turns, which fourth differences hardly contain.
+
+    White noise on terms up to order 12, where the variance is known.
+    """
+    terms, turns = terms_up_to(12), 60
+    radius, angle = np.linspace(12.7e-3, 0, 12_000), np.linspace(0, 2 * np.pi * turns, 12_000)
+    x, y = radius * np.cos(angle) + DISC.x, radius * np.sin(angle) + DISC.y
+    columns = zernike_values(*DISC.scaled(x, y), terms)
+    inverse = np.linalg.inv((columns * radius) @ columns.T)
+    true = inverse @ ((columns * radius**2) @ columns.T) @ inverse
+    around = np.exp(2j * np.pi * np.arange(100) / 100)
+    for share in (1.0, 0.95, 0.7):
+        there = zernike_values(share * around.real, share * around.imag, terms)
+        stated = [
+            np.mean(
+                there * (fit_zernikes(x, y, noise, terms, DISC, weights=radius).covariance @ there)
+            )
+            for noise in np.random.default_rng(4).normal(0, 1, (4, len(x)))
+        ]
+        assert 0.8 < np.mean(stated) / np.mean(there * (true @ there)) < 1.5
 
 
 def test_errors_that_hang_together_count_as_such():
