@@ -452,7 +452,8 @@ def profiles(map_: DeviationMap, disc: Aperture) -> dict[str, UncertainCurve]:
     if np.any(rim := np.hypot(x, y) >= _EDGE * disc.radius):
         narrow = _ring(x[rim], y[rim], disc.radius / _FINER_AT_EDGE, disc.radius)
         made["edge"] = lambda d: radial_profile(x[rim], y[rim], d[:, rim], spacing=narrow)
-    found = {name: _curve(map_, average) for name, average in made.items()}
+    rows = np.vstack([map_.deviation, map_.effects])
+    found = {name: _curve(average(rows), map_.noise) for name, average in made.items()}
     return {name: curve for name, curve in found.items() if len(curve.position)}
 
 
@@ -492,8 +493,7 @@ def _ring(x: FloatArray, y: FloatArray, *radii: float) -> float:
     return float(widths[-1])
 
 
-def _curve(map_: DeviationMap, average: Callable[[FloatArray], Profile]) -> UncertainCurve:
-    profile = average(np.vstack([map_.deviation, map_.effects]))
+def _curve(profile: Profile, noise: float) -> UncertainCurve:
     of_effects = np.sum(profile.value[1:] ** 2, axis=0)
-    variance = map_.noise**2 / np.maximum(profile.points, 1) + of_effects
+    variance = noise**2 / np.maximum(profile.points, 1) + of_effects
     return UncertainCurve(profile.position, profile.value[0], np.sqrt(variance))

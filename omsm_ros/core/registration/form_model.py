@@ -138,15 +138,16 @@ class FormNormalEquations:
         self.scores = np.zeros(self.columns)
 
     def add(self, columns: FloatArray, deviation: FloatArray, systematic: FloatArray,
-            residual: FloatArray, near: BoolArray | None = None) -> None:  # fmt: skip
+            residual: FloatArray, near: BoolArray | None = None,
+            gram: FloatArray | None = None) -> None:  # fmt: skip
         """Add points: columns (q, n), deviation (n,), systematic (s, n), residual (n,).
 
-        near: which of them to add (n,), None for all
+        near: which of them to add (n,), None for all;  gram: of their columns (q, q) if it is known
         """
         if near is not None and not np.all(near):
             columns, systematic = columns[:, near], systematic[:, near]
             deviation, residual = deviation[near], residual[near]
-        self.gram[:, : self.columns] += columns @ columns.T
+        self.gram[:, : self.columns] += columns @ columns.T if gram is None else gram
         self.gram[:, self.columns :] += columns @ np.vstack([deviation, systematic]).T
         self.points += len(deviation)
         self.square += float(residual @ residual)
@@ -318,29 +319,42 @@ def outlier_limit(residual: FloatArray) -> float:
     return max(OUTLIER_SIGMAS * statistics.spread(residual), _BEYOND_COMMON * common, LEAST_LIMIT_M)
 
 
-def best_matching_sum(columns: FloatArray, deviation: FloatArray) -> tuple[FloatArray, float]:
-    """Return the coefficients (q,) of the fit of ``columns`` (q, n), and the outlier limit [m].
+class FreeFit(NamedTuple):
+    """Coefficients (q,) of columns, residual (n,) [m] of their sum, and outlier limit [m].
+
+    near: points within the limit (n,);  gram: products of the columns over these (q, q)
+    """
+
+    coefficients: FloatArray
+    residual: FloatArray
+    limit: float
+    near: BoolArray
+    gram: FloatArray
+
+
+def best_matching_sum(columns: FloatArray, deviation: FloatArray) -> FreeFit:
+    """Return the fit of ``columns`` (q, n) to the ``deviation`` (n,) [m] without its outliers.
 
     The fit is free of any prior, because the residual of a large step or of an unknown form is
     neither noise nor an outlier.
     """
     scale = np.sqrt(np.mean(columns**2, axis=1))
     scale[scale == 0] = 1.0
-    limit, residual, fitted = np.inf, deviation, np.zeros(len(columns))
-    whole = columns @ columns.T
+    gram = whole = columns @ columns.T
+    near = np.ones(len(deviation), np.bool_)
     for _ in range(_DUST_PASSES):
-        chosen = np.abs(residual) <= limit
-        # Few are beyond the limit: to take them off is less work than to copy all others.
-        far = columns[:, ~chosen]
-        gram = (whole - far @ far.T) / np.outer(scale, scale)
-        right = columns @ np.where(chosen, deviation, 0.0) / scale
-        values, ways = np.linalg.eigh(gram)
+        right = columns @ np.where(near, deviation, 0.0) / scale
+        values, ways = np.linalg.eigh(gram / np.outer(scale, scale))
         sums = ways.T @ right / np.maximum(values, _ROUNDING * values[-1])
-        most = _MOST_CANCELLED * np.sqrt(np.mean(deviation[chosen] ** 2))
+        most = _MOST_CANCELLED * np.sqrt(np.mean(deviation[near] ** 2))
         known = (values > _ROUNDING * values[-1]) & (np.abs(sums) <= most)
         fitted = np.asarray(ways @ np.where(known, sums, 0.0) / scale)
         residual = deviation - fitted @ columns
         limit = outlier_limit(residual)
-        if np.array_equal(np.abs(residual) <= limit, chosen):
+        before, near = near, np.abs(residual) <= limit
+        if np.array_equal(before, near):
             break
-    return fitted, limit
+        # Few are beyond the limit: to take them off is less work than to copy all others.
+        far = columns[:, ~near]
+        gram = whole - far @ far.T
+    return FreeFit(fitted, residual, limit, near, gram)

@@ -365,11 +365,10 @@ class _PoseFit:
             points = inside_aperture(placed(self.surface, at, chosen), self.aperture)
             z = self.basis.columns(points.x, points.y)
             columns = np.concatenate([-dof_columns(at, points, self.names), z])
-            like, limit = best_matching_sum(columns, points.deviation)
-            residual = points.deviation - like @ columns
+            like, residual, _, near, gram = best_matching_sum(columns, points.deviation)
             sums = FormNormalEquations(len(self.names) + len(self.basis), 0)
-            none, near = np.empty((0, len(residual))), np.abs(residual) <= limit
-            sums.add(columns, points.deviation, none, residual, near)
+            none = np.empty((0, len(residual)))
+            sums.add(columns, points.deviation, none, residual, near, gram)
             found, _ = self.solved(at, sums)
             settled = max(SHARE_OF_SPREAD * statistics.spread(residual), LEAST_LIMIT_M)
             # The joint effect counts: a tilt may cancel a shift.

@@ -223,12 +223,12 @@ def test_a_sum_of_columns_is_found_whatever_a_few_specks_do():
     columns[2] *= 1e6
     truth = np.array([1e-7, -2e-7, 3e-13])
     deviation = truth @ columns + 1e-9 * RNG.normal(size=2000)
-    clean, limit = best_matching_sum(columns, deviation)
+    clean, _, limit, *_ = best_matching_sum(columns, deviation)
     np.testing.assert_allclose(clean, truth, rtol=0.02)
     assert limit == pytest.approx(5e-9, rel=0.15)
     dusty = deviation.copy()
     dusty[::100] += 1e-5
-    found, limit = best_matching_sum(columns, dusty)
+    found, _, limit, *_ = best_matching_sum(columns, dusty)
     np.testing.assert_allclose(found, clean, rtol=0.01)
     assert limit < 1e-8
 
@@ -239,7 +239,7 @@ def test_columns_that_are_nearly_alike_do_not_follow_a_speck():
     columns = np.stack([x**2, x**2 + 1e-3 * (x == x[-1])])
     deviation = 1e-7 * x**2 + 1e-9 * RNG.normal(size=2000)
     deviation[-1] += 1e-5
-    found, limit = best_matching_sum(columns, deviation)
+    found, _, limit, *_ = best_matching_sum(columns, deviation)
     assert abs(deviation[-1] - (found @ columns)[-1]) > 100 * limit
     np.testing.assert_allclose(found @ columns[:, 500], 1e-7 * x[500] ** 2, rtol=0.02)
 
@@ -247,14 +247,14 @@ def test_columns_that_are_nearly_alike_do_not_follow_a_speck():
 def test_without_specks_it_is_the_least_squares_of_numpy():
     columns = RNG.normal(size=(3, 500))
     deviation = RNG.uniform(-1, 1, 500)
-    found, _ = best_matching_sum(columns, deviation)
+    found, *_ = best_matching_sum(columns, deviation)
     expected = np.linalg.lstsq(columns.T, deviation, rcond=None)[0]
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_a_column_of_nothing_takes_no_part():
     columns = np.stack([np.ones(100), np.zeros(100)])
-    found, limit = best_matching_sum(columns, np.full(100, 3e-9))
+    found, _, limit, *_ = best_matching_sum(columns, np.full(100, 3e-9))
     np.testing.assert_allclose(found, [3e-9, 0.0])
     assert limit == LEAST_LIMIT_M
 
