@@ -31,7 +31,6 @@ from omsm_ros.core.form.part_figures import (
     less,
     products,
     rms_of_part,
-    root_of_products,
     short_waves,
     without_terms,
 )
@@ -49,7 +48,7 @@ from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule
 from omsm_ros.core.registration.placement import Placed, PointBatch, PointBatches, placed
-from omsm_ros.core.registration.pose_parameters import Registration
+from omsm_ros.core.registration.pose_parameters import Registration, root_of
 from omsm_ros.core.registration.register import CHUNK, register
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.streams.statistics import EvenSelection, noise_of
@@ -140,7 +139,7 @@ def _noise_of_rings(noise: float, weighted: FloatArray, gram: FloatArray) -> Flo
     power, own = slice(len(POWER)), slice(len(POWER), None)
     half = fitted(gram[own, own], weighted[own] @ weighted[own].T)
     covariance = fitted(gram[own, own], half.T)
-    root = noise * root_of_products(covariance).T
+    root = noise * root_of(covariance).T
     return np.concatenate([-fitted(gram[power, power], gram[power, own]) @ root, root])
 
 

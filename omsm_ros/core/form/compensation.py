@@ -51,19 +51,13 @@ class Compensation:
 
     def between(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the offsets [m] at x, y (n,) [m], linear between cells; NaN outside of them."""
-        column, row = ((v - g[0]) / (g[1] - g[0]) for v, g in ((x, self.x), (y, self.y)))
-        total, weight = np.zeros(len(x)), np.zeros(len(x))
-        for right in (0, 1):
-            for above in (0, 1):
-                c, r = np.floor(column).astype(int) + right, np.floor(row).astype(int) + above
-                inside = (c >= 0) & (c < len(self.x)) & (r >= 0) & (r < len(self.y))
-                value = np.full(len(x), np.nan)
-                value[inside] = self.offset[r[inside], c[inside]]
-                near = np.where(
-                    np.isfinite(value), (1 - np.abs(column - c)) * (1 - np.abs(row - r)), 0.0
-                )
-                total += near * np.nan_to_num(value)
-                weight += near
+        from scipy.ndimage import map_coordinates  # takes 0.1 s to load
+
+        at = [(v - g[0]) / (g[1] - g[0]) for v, g in ((y, self.y), (x, self.x))]
+        total, weight = (
+            map_coordinates(values, at, order=1, mode="grid-constant")
+            for values in (np.nan_to_num(self.offset), np.isfinite(self.offset).astype(np.float64))
+        )
         return np.where(weight > 0, total / np.where(weight > 0, weight, 1.0), np.nan)
 
 

@@ -30,10 +30,10 @@ from omsm_ros.core.form.part_figures import (
     length,
     of_square,
     real_effects,
-    root_of_products,
     with_and_without,
 )
 from omsm_ros.core.form.zernike_fit import ZernikeFit, continued, fit_zernikes, separable
+from omsm_ros.core.registration.pose_parameters import root_of
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
@@ -490,10 +490,10 @@ def _drawn(
     _, cell = np.unique(part.cell[points], return_inverse=True)
     noise = random.normal(size=(int(cell.max()) + 1, _DRAWS))[cell]
     noisy = still + noise * part.error[points, np.newaxis]
-    errors = [effects[real_effects(map_)], root_of_products(part.smooth.covariance) @ terms]
+    errors = [effects[real_effects(map_)], root_of(part.smooth.covariance) @ terms]
     drawn = noisy + anew(np.concatenate(errors))
     bounded = drawn + anew(effects[map_.bounds]) if len(map_.bounds) else drawn
     if not len(taken):
         return drawn, bounded, still, still, noisy
-    likely, full = anew(root_of_products(map_.taken) @ taken), anew(taken)
+    likely, full = anew(root_of(map_.taken) @ taken), anew(taken)
     return drawn, bounded, still + likely, still + full, noisy

@@ -73,12 +73,6 @@ def either(measured: UncertainValue, quiet: UncertainValue) -> UncertainValue:
     )
 
 
-def root_of_products(products: FloatArray) -> FloatArray:
-    """Return rows (k, k) whose outer products add up to these mean ``products`` (k, k)."""
-    values, vectors = np.linalg.eigh(products)
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T, np.float64)
-
-
 def real_effects(map_: DeviationMap) -> BoolArray:
     """Return which effects (e,) are of errors that are certainly present."""
     real = np.ones(len(map_.effects), np.bool_)

@@ -293,8 +293,7 @@ class UncertainCurve:
 
     def entry(self) -> dict[str, list[float]]:
         """Return the JSON values for result files."""
-        names = ("position", "value", "uncertainty")
-        return {name: getattr(self, name).tolist() for name in names}
+        return {name: values.tolist() for name, values in vars(self).items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -121,13 +121,8 @@ def fit_zernikes(
     The covariance includes errors that are correlated over a pass of the path. Raises DataError
     for fewer than two points a term, or points that determine no term.
     """
-    if len(x) < max(2 * len(terms), 8):
-        raise DataError(
-            "form.few_points_for_terms",
-            points=len(x),
-            terms=len(terms),
-            least=max(2 * len(terms), 8),
-        )
+    if len(x) < (least := max(2 * len(terms), 8)):
+        raise DataError("form.few_points_for_terms", points=len(x), terms=len(terms), least=least)
     more = np.empty((0, len(x))) if effects is None else effects
     values = np.concatenate([deviation[np.newaxis], more])
     gram, right = _normal_equations(x, y, values, terms, disc, weights)

@@ -327,12 +327,7 @@ class OpenUncertainty(NamedTuple):
     """
 
     unknown: dict[str, dict[str, FloatArray]]
-    held: FloatArray
-
-    @classmethod
-    def of(cls, unknown: dict[str, dict[str, FloatArray]]) -> OpenUncertainty:
-        """Return the pose errors where nothing is held."""
-        return cls(unknown, np.empty((0, 0)))
+    held: FloatArray = np.empty((0, 0))
 
     def by_source(
         self,
@@ -368,6 +363,7 @@ class OpenUncertainty(NamedTuple):
 def root_of(covariance: FloatArray) -> FloatArray:
     """Return rows (p, p) whose outer products add up to ``covariance``."""
     scale = np.sqrt(np.diag(covariance))
+    scale[scale == 0] = 1.0
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     return np.asarray((np.sqrt(np.maximum(values, 0.0)) * vectors).T * scale, np.float64)
 

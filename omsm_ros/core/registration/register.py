@@ -173,7 +173,7 @@ def register(
     basis = FormBasis.over(x, y, area, disc)
     fit = _PoseFit(surface, dofs, aperture, basis, at)
     stand = fit.refine(at, chosen)
-    open_ = OpenUncertainty.of(fit.unknown(stand.at, chosen))
+    open_ = OpenUncertainty(fit.unknown(stand.at, chosen))
     if AUTO in asked:
         fit, stand, open_ = _useful(fit, stand, chosen, asked, open_)
     if aperture is None:

@@ -169,7 +169,7 @@ def line_profile(
     Points within ``half_width`` [m] of the line are averaged over every ``spacing`` [m].
     deviation: (n,), or several (e, n) [m]
     """
-    _check_all(x, y, deviation)
+    _check(x=x, y=y, deviation=np.sum(np.atleast_2d(deviation), axis=0))
     along = x * np.cos(angle) + y * np.sin(angle)
     across = y * np.cos(angle) - x * np.sin(angle)
     near = np.abs(across) <= half_width
@@ -185,7 +185,7 @@ def radial_profile(
     that other orders average to zero. ``spacing`` should exceed the feed per turn.
     deviation: (n,), or several (e, n) [m]
     """
-    _check_all(x, y, deviation)
+    _check(x=x, y=y, deviation=np.sum(np.atleast_2d(deviation), axis=0))
     radius = np.hypot(x, y)
     ring = _intervals(radius, spacing)
     sector = np.floor(np.arctan2(y, x) / (2 * np.pi) * _SECTORS).astype(np.int64) % _SECTORS
@@ -226,11 +226,6 @@ def _intervals(position: FloatArray, spacing: float) -> IntArray:
     if extent > _MOST_INTERVALS:
         raise DataError("surface.intervals", spacing=spacing, intervals=extent)
     return np.asarray(np.floor(position / spacing), np.int64)
-
-
-def _check_all(x: FloatArray, y: FloatArray, deviations: FloatArray) -> None:
-    for deviation in np.atleast_2d(deviations):
-        _check(x=x, y=y, deviation=deviation)
 
 
 def _check(**arrays: FloatArray) -> None:

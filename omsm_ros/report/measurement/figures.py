@@ -41,12 +41,8 @@ _FULL_WIDTH = 6.1, 5.1
 _BAR_PLACE = (0.815, 0.19, 0.026, 0.645)
 
 
-def symmetric_limits(x: FloatArray, y: FloatArray, deviation: FloatArray) -> Limits:
+def symmetric_limits(raster: Raster) -> Limits:
     """Return the colour limits ±v [m] that hold all but 0.2 % of the pixels of a map."""
-    return _symmetric(rasterise(x, y, deviation))
-
-
-def _symmetric(raster: Raster) -> Limits:
     size = np.abs(raster.image[np.isfinite(raster.image)])
     bound = float(np.quantile(size, _SHOWN_SHARE)) or NANOMETRE_M
     return -bound, bound
@@ -110,7 +106,7 @@ def _draw_map(
     # Fixed positions, so that maps side by side have equal size.
     axes, bar = part.add_axes(_MAP_PLACE), part.add_axes(_BAR_PLACE)
     style.quiet(axes)
-    low, high = limits or _symmetric(raster)
+    low, high = limits or symmetric_limits(raster)
     left, right, bottom, top = (edge / MILLIMETRE_M for edge in raster.extent)
     image = axes.imshow(
         raster.image / scale,
@@ -234,7 +230,7 @@ def surface_figures(cloud: CloudView, nominal: Surface | None) -> dict[str, byte
     else:
         corrected, raw = levelled(cloud, nominal)
         made |= _profiles(cloud, {"raw": raw, "corrected": corrected})
-        limits = symmetric_limits(cloud.x, cloud.y, raw)
+        limits = symmetric_limits(rasterise(cloud.x, cloud.y, raw))
         unit = unit_for(limits[1])
         maps = {
             "raw_map": (raw, unit, "Uncorrected", limits, "deviation"),
@@ -327,33 +323,38 @@ _BELOW = 0.2
 _WIDE, _HIGH = 6.1, 3.7
 _BELOW_BARS = 0.2
 _AREAL_PLACE, _AREAL_BAR_PLACE = (0.17, 0.125, 0.6, 0.78), (0.8, 0.125, 0.025, 0.78)
-# Positions of a curve that is drawn, and steps over the usual one that interrupt it.
-_LEAST_DRAWN, _GAP = 2, 4.0
-_FORM_LINES = {"x": "along x", "y": "along y", "diagonal": "along x = y"}
+# Steps over the usual one that interrupt a curve.
+_GAP = 4.0
+# Unit and name of the horizontal axis, and title of each curve, by figure; the lines have one axis.
+_LINE = (MILLIMETRE_M, "position on the line [mm]")
+_CURVES = {
+    "form_lines": {
+        "x": (*_LINE, "Registered deviation along x"),
+        "y": (*_LINE, "Registered deviation along y"),
+        "diagonal": (*_LINE, "Registered deviation along x = y"),
+    },
+    "form_rings": {
+        "radius": (MILLIMETRE_M, "radius [mm]", "Registered deviation over the radius"),
+        "edge": (MILLIMETRE_M, "radius [mm]", "At the edge, outer tenth of the radius"),
+        "angle": (DEGREE_RAD, "angle from x [°]", "Around, outer third of the radius"),
+    },
+}
 
 
 def form_figures(form: Mapping[str, Any], curves: Mapping[str, Any]) -> dict[str, bytes]:
     """Return PNG files by the names of the page; parts that were not computed have none."""
     made = {"zernike_terms": zernike_terms(form["zernike"])}
     profiles: Mapping[str, Any] = curves.get("profiles") or {}
-    if lines := {name: profiles[name] for name in _FORM_LINES if _drawable(profiles.get(name))}:
-        made["form_lines"] = line_profiles(lines)
-    if rings := {
-        name: profiles[name]
-        for name in ("radius", "edge", "angle")
-        if _drawable(profiles.get(name))
-    }:
-        made["form_rings"] = ring_profiles(rings)
+    for figure, kinds in _CURVES.items():
+        if shown := [name for name in kinds if len(profiles.get(name, {}).get("position", ())) > 1]:
+            drawn = [(profiles[name], kinds[name]) for name in shown]
+            made[figure] = curve_panels(drawn, sharex=figure == "form_lines")
     if density := curves.get("psd"):
         made["psd_radial"] = radial_density(density["radial"])
         made["psd_direction"] = direction_density(density["azimuthal"])
         if "areal" in density:
             made["psd_areal"] = areal_density(density["areal"])
     return {name: style.png(figure) for name, figure in made.items()}
-
-
-def _drawable(curve: Mapping[str, Any] | None) -> bool:
-    return curve is not None and len(curve["position"]) >= _LEAST_DRAWN
 
 
 def zernike_terms(terms: Sequence[Mapping[str, Any]]) -> Figure:
@@ -377,28 +378,20 @@ def zernike_terms(terms: Sequence[Mapping[str, Any]]) -> Figure:
     return made
 
 
-def line_profiles(lines: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Draw deviations [nm] over the position [mm] on each line, with ±2u; one panel per line."""
-    made, axes = style.figure(_WIDE, 1.4 * len(lines) + 0.4, rows=len(lines), sharex=True)
-    for ax, (name, curve) in zip(axes[:, 0], lines.items(), strict=True):
-        _draw_curve(ax, curve, MILLIMETRE_M, NANOMETRE_M)
-        style.label(ax, y="deviation [nm]", title=f"Registered deviation {_FORM_LINES[name]}")
-    style.label(axes[-1, 0], x="position on the line [mm]")
-    return made
+def curve_panels(
+    curves: Sequence[tuple[Mapping[str, Any], tuple[float, str, str]]], *, sharex: bool
+) -> Figure:
+    """Draw deviations [nm] over their positions, with ±2u; one panel for each curve.
 
-
-def ring_profiles(rings: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Draw deviations [nm] over the radius [mm], mean of each ring, and the angle [°], with ±2u."""
-    made, axes = style.figure(_WIDE, 1.7 * len(rings) + 0.4, rows=len(rings))
-    kinds = {
-        "radius": (MILLIMETRE_M, "radius [mm]", "Registered deviation over the radius"),
-        "edge": (MILLIMETRE_M, "radius [mm]", "At the edge, outer tenth of the radius"),
-        "angle": (DEGREE_RAD, "angle from x [°]", "Around, outer third of the radius"),
-    }
-    for ax, (name, curve) in zip(axes[:, 0], rings.items(), strict=True):
-        unit, x, title = kinds[name]
+    curves: each with unit and name of its horizontal axis, and its title;  sharex: one axis for all
+    """
+    made, axes = style.figure(
+        _WIDE, (1.4 if sharex else 1.7) * len(curves) + 0.4, rows=len(curves), sharex=sharex
+    )
+    for ax, (curve, (unit, along, title)) in zip(axes[:, 0], curves, strict=True):
         _draw_curve(ax, curve, unit, NANOMETRE_M)
-        style.label(ax, x=x, y="deviation [nm]", title=title)
+        named = {} if sharex and ax is not axes[-1, 0] else {"x": along}
+        style.label(ax, y="deviation [nm]", title=title, **named)
     return made
 
 

@@ -11,6 +11,7 @@ from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.deviation import Profile
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.report.measurement import figures
+from omsm_ros.report.measurement.surface_map import rasterise
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +62,7 @@ class TestDeviationMap:
         )
 
     def test_two_maps_with_the_same_limits_have_the_same_colours(self, cloud, deviations):
-        limits = figures.symmetric_limits(cloud.x, cloud.y, deviations["raw"])
+        limits = figures.symmetric_limits(rasterise(cloud.x, cloud.y, deviations["raw"]))
         drawn = [
             figures.deviation_map(cloud.x, cloud.y, d, unit="µm", title="", limits=limits)
             for d in deviations.values()
@@ -70,15 +71,15 @@ class TestDeviationMap:
         assert one == other == pytest.approx(np.array(limits) / 1e-6)
 
     def test_own_limits_hold_nearly_all_and_are_symmetric(self, cloud, deviations):
-        low, high = figures.symmetric_limits(cloud.x, cloud.y, deviations["raw"])
+        low, high = figures.symmetric_limits(rasterise(cloud.x, cloud.y, deviations["raw"]))
         assert low == -high
         assert np.mean(np.abs(deviations["raw"]) <= high) > 0.99
 
     def test_one_outlier_does_not_take_the_colours(self, cloud, deviations):
         spoilt = deviations["corrected"].copy()
         spoilt[9] = 1e-3
-        expected = figures.symmetric_limits(cloud.x, cloud.y, deviations["corrected"])
-        assert figures.symmetric_limits(cloud.x, cloud.y, spoilt) == pytest.approx(
+        expected = figures.symmetric_limits(rasterise(cloud.x, cloud.y, deviations["corrected"]))
+        assert figures.symmetric_limits(rasterise(cloud.x, cloud.y, spoilt)) == pytest.approx(
             expected, rel=0.1
         )
 
@@ -93,7 +94,7 @@ class TestDeviationMap:
         assert figure.get_axes()[0].get_images()[0].colorbar.extend == extend
 
     def test_a_perfect_surface_is_drawn(self, cloud):
-        assert figures.symmetric_limits(cloud.x, cloud.y, np.zeros(len(cloud)))[1] > 0
+        assert figures.symmetric_limits(rasterise(cloud.x, cloud.y, np.zeros(len(cloud))))[1] > 0
 
 
 class TestProfile:

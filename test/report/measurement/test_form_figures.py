@@ -64,7 +64,8 @@ def test_bars_are_nanometres_grey_within_their_uncertainty_and_nothing_is_cut():
 
 
 def test_profiles_are_nanometres_over_millimetres_with_twice_their_uncertainty():
-    figure = form_figures.line_profiles({"x": CURVES["profiles"]["x"]})
+    curve = CURVES["profiles"]["x"], (1e-3, "position [mm]", "along x")
+    figure = form_figures.curve_panels([curve], sharex=True)
     axes = figure.axes[0]
     line = axes.lines[0]
     assert line.get_xdata() == pytest.approx([-2.0, 0.0, 2.0])
