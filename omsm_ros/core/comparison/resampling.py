@@ -165,6 +165,9 @@ class LocalHeights:
 class LocalQuadratic:
     """Surface between its points by local quadratic regression on cells of side ``cell`` [m].
 
+    scatter: robust standard deviation of a point about the surface between its neighbours [m],
+        with wavelengths shorter than a local fit resolves
+
     Raises DataError for points that fill fewer than nine cells.
     """
 
@@ -182,7 +185,7 @@ class LocalQuadratic:
         some = slice(None, None, max(len(points) // _PROBED, 1))
         near = self.at(points.x[some], points.y[some])
         residual = (points.height[some] - near.value)[np.isfinite(near.value)]
-        self._scatter = spread(residual) if len(residual) else 0.0
+        self.scatter = spread(residual) if len(residual) else 0.0
 
     def at(self, x: FloatArray, y: FloatArray) -> LocalHeights:
         """Return the heights, slopes and their uncertainties at x, y [m], each (m,)."""
@@ -196,14 +199,6 @@ class LocalQuadratic:
         # Nine cells within a radius of a place lie within two radii of each of the nine.
         least = self._tree.query(self._tree.data, k=[_LEAST_NEIGHBOURS])[0].min()
         return bool(least <= 2 * RADIUS_CELLS * self.cell)
-
-    @property
-    def scatter(self) -> float:
-        """Robust standard deviation of a point about the surface between its neighbours [m].
-
-        It includes wavelengths shorter than a local fit resolves.
-        """
-        return self._scatter
 
     def carried(self, rows: Rows, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return errors of the points interpolated to x, y (m,), row by row, (s, m) [m].
@@ -280,9 +275,11 @@ class LocalQuadratic:
         )
         inside = index < len(cells.x)
         index = np.where(inside, index, 0)
-        weight = np.where(inside, (1 - np.minimum(distance / radius, 1.0) ** 3) ** 3, 0.0)
+        share = np.minimum(distance / radius, 1.0)  # 1 without a cell
+        weight = 1 - share * share * share  # powers take longer
+        weight *= weight * weight
         # The weight saturates, because the model error does not fall with the number of points.
-        weight *= cells.points[index] / (cells.points[index] + np.median(cells.points))
+        weight *= (cells.points / (cells.points + np.median(cells.points)))[index]
         u = np.where(inside, (cells.x[index] - x[:, None]) / radius, 0.0)
         v = np.where(inside, (cells.y[index] - y[:, None]) / radius, 0.0)
         good = np.asarray(inside.sum(axis=1) >= _LEAST_NEIGHBOURS, np.bool_)
@@ -299,15 +296,17 @@ def _first_rows(
     The mean of the quadratic over the points of a cell is fitted to the mean of the cell.
     """
     uu, uv, vv = moments
-    basis = np.stack([np.ones_like(u), u, v, u * u + uu, u * v + uv, v * v + vv], axis=2)
-    weighted = (basis * weight[:, :, None]).transpose(0, 2, 1)
-    normal = weighted @ basis
+    basis = np.stack([np.ones_like(u), u, v, u * u + uu, u * v + uv, v * v + vv], axis=1)
+    weighted = basis * weight[:, None]
+    normal = weighted @ basis.transpose(0, 2, 1)
     scale = np.sqrt(np.einsum("mii->mi", normal))
     normal /= scale[:, :, None] * scale[:, None, :]
-    lowest = np.linalg.eigvalsh(normal)[:, 0] if len(normal) else np.empty(0)
+    # The eigenvalues sum to six, so that the lowest is at least the determinant over (6 / 5)⁵.
+    doubtful = np.flatnonzero(np.linalg.det(normal) < 1.2**5 * _WORST_CONDITION)
+    flat = doubtful[np.linalg.eigvalsh(normal[doubtful])[:, 0] < _WORST_CONDITION]
     # Where cells lie on two lines only, regularisation keeps the value and drops the curvature
     # across the lines.
-    normal += np.where(lowest < _WORST_CONDITION, 1e-4, 0.0)[:, None, None] * np.eye(6)
+    normal[flat] += 1e-4 * np.eye(6)
     first = np.eye(6)[:, :3] / scale[:, :, None]
     solved = np.linalg.solve(normal, first) / scale[:, :, None]
     return np.asarray(solved.transpose(0, 2, 1) @ weighted, np.float64)
