@@ -34,6 +34,14 @@ def _tree(path):
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
+def _statements(node):
+    """Yield the statements below ``node``: all of its functions, in a tenth of the time of all."""
+    for block in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for child in getattr(node, block, ()):
+            yield child
+            yield from _statements(child)
+
+
 def test_the_import_contracts_hold():
     """The contracts stand in pyproject.toml; ``lint-imports`` prints what breaks them."""
     assert lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True) == 0
@@ -101,7 +109,7 @@ def evaluates_foreign_text(name, tree):
 
 def functions_are_too_long(name, tree):
     """From the first line of a function to its last, without its docstring."""
-    for node in ast.walk(tree):
+    for node in _statements(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             lines = node.end_lineno - node.lineno + 1
             if ast.get_docstring(node) is not None:
@@ -164,6 +172,12 @@ BROKEN = [
     (evaluates_foreign_text, "io.new", "np.load(f, allow_pickle=True)", "pickled"),
     (evaluates_foreign_text, "io.new", "def f():\n    import pickle", "imports pickle"),
     (functions_are_too_long, "io.new", "def f():\n" + 50 * "    pass\n", "has 51 lines"),
+    (
+        functions_are_too_long,
+        "io.new",
+        "try: ...\nexcept E:\n def f():\n" + 50 * "  1\n",
+        "51 lines",
+    ),
     (public_names_lack_a_docstring, "io.new", "x = 1", "io.new has no docstring"),
     (public_names_lack_a_docstring, "io.new", "'M.'\ndef f(): ...", "f has no docstring"),
     (public_names_lack_a_docstring, "io.new", "'M.'\nclass C:\n 'C.'\n def m(s): ...", "m has no"),
@@ -207,7 +221,7 @@ def test_few_files_are_imported_by_one_other_only():
     importers = Counter()
     for path in MODULES:
         imported = set()
-        for node in ast.walk(_tree(path)):
+        for node in _statements(_tree(path)):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("omsm_ros"):
                 module = node.module.removeprefix("omsm_ros").lstrip(".")
                 for alias in node.names:

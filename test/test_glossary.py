@@ -31,11 +31,17 @@ PATTERN = re.compile(
 SET_BY_USERS = {("core/ripple/accelerometer.py", "carriage")}
 
 
+def _parted(name):
+    return re.sub(r"([a-z])([A-Z])", r"\1 \2", name).replace("_", " ")
+
+
 def forbidden_words(source):
     """Yield (line, word) of forbidden words in names, comments, docstrings and texts."""
+    if not (PATTERN.search(source) or PATTERN.search(_parted(source))):
+        return  # without its tokens, which take longer
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.NAME:
-            words = re.sub(r"([a-z])([A-Z])", r"\1 \2", token.string).replace("_", " ")
+            words = _parted(token.string)
         elif token.type in (tokenize.COMMENT, tokenize.STRING):
             words = token.string
         else:

@@ -40,7 +40,7 @@ def scan_into(folder, calibration, seed, rpm, feed, astigmatism):
 @pytest.fixture(scope="module")
 def results(tmp_path_factory, true_calibration):
     root = tmp_path_factory.mktemp("results")
-    ways = {"slow": (11, 30, 1.0e-4, 80e-9), "fast": (12, 45, 1.3e-4, 80e-9)}
+    ways = {"slow": (11, 30, 2.0e-4, 80e-9), "fast": (12, 45, 2.6e-4, 80e-9)}
     return {n: scan_into(root / n, true_calibration, *way) for n, way in ways.items()}
 
 
@@ -48,7 +48,7 @@ def results(tmp_path_factory, true_calibration):
 def other(tmp_path_factory, true_calibration):
     """Scan a part with more astigmatism, as fast."""
     folder = tmp_path_factory.mktemp("other") / "scan"
-    return scan_into(folder, true_calibration, 12, 45, 1.3e-4, 120e-9)
+    return scan_into(folder, true_calibration, 12, 45, 2.6e-4, 120e-9)
 
 
 def difference(capsys, out, *arguments):

@@ -112,6 +112,7 @@ WRITER = """
 import sys
 from pathlib import Path
 from omsm_ros.pipelines.history import keep_measurement
+print("begins", flush=True)
 for i in range(10):
     assert keep_measurement(sys.argv[1], Path(sys.argv[2]) / str(i))
 """
@@ -121,11 +122,12 @@ def test_two_writers_at_once_lose_nothing(tmp_path, address):
     for writer in "ab":
         for i in range(10):
             result(tmp_path / writer / str(i))
-    writers = [
-        subprocess.Popen([sys.executable, "-c", WRITER, address, str(tmp_path / writer)])
-        for writer in "ab"
-    ]
-    assert [writer.wait() for writer in writers] == [0, 0]
+    command = [sys.executable, "-c", WRITER, address, str(tmp_path / "a")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"begins\n"
+        for i in range(10):
+            assert keep_measurement(address, tmp_path / "b" / str(i))
+    assert other.returncode == 0
     (machine,) = history(address)[0]
     assert len({row["folder"] for row in machine.measurements}) == 20
 

@@ -156,7 +156,7 @@ def refused(node_server, tmp_path):
 def cell(tmp_path, monkeypatch, request):
     """All that is started ends with the test; it is started in the test's folder.
 
-    The nodes are forks of one process, in soak tests processes of their own.
+    The nodes are forks of one process, in soak tests processes of their own, as users start them.
     """
     monkeypatch.chdir(tmp_path)
     from system.forked_nodes import ForkedNodes
@@ -166,13 +166,6 @@ def cell(tmp_path, monkeypatch, request):
         return
     with ForkedNodes(tmp_path / "log", request.getfixturevalue("node_server")) as processes:
         yield from cell_of(processes, tmp_path)
-
-
-@pytest.fixture
-def whole_cell(tmp_path, monkeypatch):
-    """A cell whose nodes are processes of their own, as users start them."""
-    monkeypatch.chdir(tmp_path)
-    yield from cell_of_commands(tmp_path)
 
 
 def cell_of_commands(folder):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from omsm_msgs.srv import Identify, LoadCalibration, PredictError
 from plain_method import plain_height
+from soaked import soaked
 from std_srvs.srv import Trigger
 
 from omsm_ros.core.calibration.calibration import Calibration
@@ -56,11 +57,8 @@ def assert_plain_method_agrees(plan):
     assert abs(np.mean(off)) < 1e-9
 
 
-@pytest.mark.parametrize(
-    "device", ["six_channel", *(pytest.param(name, marks=pytest.mark.soak) for name in OTHERS)]
-)
-def test_calibrate_scan_correct_and_replay(whole_cell, device):
-    cell = whole_cell
+@pytest.mark.parametrize("device", ["six_channel", *soaked("six_channel", *OTHERS)])
+def test_calibrate_scan_correct_and_replay(cell, device):
     plan = demonstration.Demonstration(
         cell.folder / "demo",
         seed=2,

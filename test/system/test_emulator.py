@@ -1,8 +1,5 @@
 """The emulator's buttons: a motion is started, refused while another runs, and stopped."""
 
-import subprocess
-import sys
-
 import pytest
 from omsm_msgs.msg import AxisBlock
 from std_srvs.srv import Trigger
@@ -57,15 +54,10 @@ def test_the_file_of_disturbances_is_played(cell):
     assert travel == pytest.approx(89.6e-6 * 1.01, abs=0.05e-6)
 
 
-def test_a_file_of_disturbances_that_cannot_be_is_one_line(tmp_path):
+def test_a_file_of_disturbances_that_cannot_be_is_one_line(refused, tmp_path):
     file = tmp_path / "disturbances.yaml"
     file.write_text("probe: {latency: 1e-3}\n")
-    command = [sys.executable, "-m", "omsm_ros.nodes.start", "cell_emulator", "--ros-args"]
-    ended = subprocess.run(
-        [*command, "-p", f"disturbances:={file}"], capture_output=True, text=True, timeout=200
-    )
-    assert ended.returncode == 2
-    (line,) = ended.stderr.strip().splitlines()
+    line = refused("cell_emulator", "-p", f"disturbances:={file}")
     assert "disturbances.yaml" in line
     assert "'latency' is unknown" in line
 

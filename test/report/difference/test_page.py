@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from functools import lru_cache
+from functools import cache
 from html import unescape
 
 import numpy as np
@@ -31,8 +31,12 @@ def measurement(name, seed, added=0.0, common=2e-9):
     return ComparedMeasurement(name=name, points=points, common=common)
 
 
-@lru_cache
 def page(added=0.0, common=2e-9, name="b.xyz"):
+    return _page(added, common, name)  # one key of the cache, however they are given
+
+
+@cache
+def _page(added, common, name):
     found = compare_measurements_of_part(
         measurement("a.xyz", 0, 0.0, common), measurement(name, 1, added, common)
     )
