@@ -320,14 +320,13 @@ def outlier_limit(residual: FloatArray) -> float:
 
 
 class FreeFit(NamedTuple):
-    """Coefficients (q,) of columns, residual (n,) [m] of their sum, and outlier limit [m].
+    """Coefficients (q,) of columns, and residual (n,) [m] of their sum.
 
-    near: points within the limit (n,);  gram: products of the columns over these (q, q)
+    near: points within its outlier limit (n,);  gram: products of the columns over these (q, q)
     """
 
     coefficients: FloatArray
     residual: FloatArray
-    limit: float
     near: BoolArray
     gram: FloatArray
 
@@ -350,11 +349,10 @@ def best_matching_sum(columns: FloatArray, deviation: FloatArray) -> FreeFit:
         known = (values > _ROUNDING * values[-1]) & (np.abs(sums) <= most)
         fitted = np.asarray(ways @ np.where(known, sums, 0.0) / scale)
         residual = deviation - fitted @ columns
-        limit = outlier_limit(residual)
-        before, near = near, np.abs(residual) <= limit
+        before, near = near, np.abs(residual) <= outlier_limit(residual)
         if np.array_equal(before, near):
             break
         # Few are beyond the limit: to take them off is less work than to copy all others.
         far = columns[:, ~near]
         gram = whole - far @ far.T
-    return FreeFit(fitted, residual, limit, near, gram)
+    return FreeFit(fitted, residual, near, gram)

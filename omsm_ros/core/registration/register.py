@@ -230,15 +230,15 @@ def _useful(
     open_: OpenUncertainty,
 ) -> tuple[_PoseFit, _PlacementState, OpenUncertainty]:
     """Hold the moves that were not asked for by name and that the points hardly determine."""
-    names, at = fit.names, stand.at
+    names, at = fit.dofs.fitted, stand.at
     values = np.array([at.value(name) for name in names])
     covariance = stand.found.covariance[: len(names), : len(names)]
     while True:
-        free = len(fit.names)
+        free = len(fit.dofs.fitted)
         weak = weakest_dof(
             fit.dofs,
             asked,
-            np.array([stand.at.value(n) for n in fit.names]),
+            np.array([stand.at.value(n) for n in fit.dofs.fitted]),
             stand.found.covariance[:free, :free],
             stand.sums.gram[:free, :free] / stand.sums.points,
         )
@@ -247,7 +247,7 @@ def _useful(
         fit = replace(fit, dofs=fit.dofs.without(*weak))
         back = stand.at.moved([weak[0]], np.array([-stand.at.value(weak[0])]))
         stand = fit.refine(
-            coarse_placement(fit.surface, chosen, fit.names, fit.aperture, back), chosen
+            coarse_placement(fit.surface, chosen, fit.dofs.fitted, fit.aperture, back), chosen
         )
     held = [names.index(n) for n in fit.dofs.held]
     square = covariance[np.ix_(held, held)] + np.outer(values[held], values[held])
@@ -267,10 +267,6 @@ class _PoseFit:
     basis: FormBasis
     plain: Placement
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.dofs.fitted
-
     def unknown(self, at: Placement, chosen: PointBatch) -> dict[str, dict[str, FloatArray]]:
         """Return the effect (2,) of each undetermined pose parameter on each fitted one.
 
@@ -287,12 +283,12 @@ class _PoseFit:
         for name in self.dofs.refused:
             ends = [
                 coarse_placement(
-                    self.surface, few, self.names, None, rigid.moved([name], np.array([off]))
+                    self.surface, few, self.dofs.fitted, None, rigid.moved([name], np.array([off]))
                 )
                 for off in (self.dofs.range(name), -self.dofs.range(name))
             ]
             found[name] = {}
-            for n in self.names:
+            for n in self.dofs.fitted:
                 high, low = (end.value(n) - rigid.value(n) for end in ends)
                 found[name][n] = np.array([(high - low) / 2, (high + low) / 2])
         return found
@@ -322,7 +318,7 @@ class _PoseFit:
             held = held_dof_effects(self.surface, at, points, names, held_effects)
             systematic = np.concatenate([part.systematic[:, good] * points.normal[2], held])
             z = self.basis.columns(points.x, points.y)
-            columns = np.concatenate([-dof_columns(at, points, self.names), z])
+            columns = np.concatenate([-dof_columns(at, points, self.dofs.fitted), z])
             residual = points.deviation - like @ columns
             near = None
             if far is not None:
@@ -333,7 +329,7 @@ class _PoseFit:
 
     def solved(self, at: Placement, sums: FormNormalEquations) -> tuple[Estimate, float]:
         """Return the estimate, and the variance of one point's noise [m²]."""
-        free = len(self.names)
+        free = len(self.dofs.fitted)
         variance = sums.square / max(sums.points - sums.columns, 1)
         own = np.diag(sums.gram)[free:]
         # Correlated errors average out more slowly, by this factor of their variance.
@@ -355,20 +351,19 @@ class _PoseFit:
         A larger offset in the least-squares fit widens the prior, unless it is declared.
         """
         known = self.dofs.declared
-        first = [0.0 if n in known else abs(self.plain.value(n)) for n in self.names]
-        value = np.array([at.value(n) for n in self.names])
-        return value, np.maximum([self.dofs.range(n) for n in self.names], first)
+        first = [0.0 if n in known else abs(self.plain.value(n)) for n in self.dofs.fitted]
+        value = np.array([at.value(n) for n in self.dofs.fitted])
+        return value, np.maximum([self.dofs.range(n) for n in self.dofs.fitted], first)
 
     def refine(self, at: Placement, chosen: PointBatch) -> _PlacementState:
         """Return the converged fit; raise DataError if there is none."""
         for turn in range(_MOST_REFINED):
             points = inside_aperture(placed(self.surface, at, chosen), self.aperture)
             z = self.basis.columns(points.x, points.y)
-            columns = np.concatenate([-dof_columns(at, points, self.names), z])
-            like, residual, _, near, gram = best_matching_sum(columns, points.deviation)
-            sums = FormNormalEquations(len(self.names) + len(self.basis), 0)
-            none = np.empty((0, len(residual)))
-            sums.add(columns, points.deviation, none, residual, near, gram)
+            columns = np.concatenate([-dof_columns(at, points, self.dofs.fitted), z])
+            like, residual, near, gram = best_matching_sum(columns, points.deviation)
+            sums = FormNormalEquations(len(self.dofs.fitted) + len(self.basis), 0)
+            sums.add(columns, points.deviation, np.empty((0, len(near))), residual, near, gram)
             found, _ = self.solved(at, sums)
             settled = max(SHARE_OF_SPREAD * statistics.spread(residual), LEAST_LIMIT_M)
             # The joint effect counts: a tilt may cancel a shift.
@@ -382,7 +377,7 @@ class _PoseFit:
             # A longer step than the deviation corrects none of it: form would have to cancel it.
             longest = sums.total / sums.points / max(square, float(np.finfo(np.float64).tiny))
             share = min(1.0, float(np.sqrt(longest)))
-            at = at.moved(self.names, share * found.step)
+            at = at.moved(self.dofs.fitted, share * found.step)
         raise DataError(NOT_SETTLED)
 
 
@@ -396,7 +391,7 @@ def _over_all(
     disc: Aperture,
 ) -> Registration:
     """Return the registration from one pass over all points, in which dust comes last."""
-    free, held = len(fit.names), root_of(open_.held)
+    free, held = len(fit.dofs.fitted), root_of(open_.held)
     sums = FormNormalEquations(free + len(fit.basis), len(sources) + 2 * len(held))
     square, points, far, beyond = 0.0, 0.0, FarPoints(stand.limit), []
     for portion in portions():
@@ -412,8 +407,8 @@ def _over_all(
     # Each column is the step of the pose for one standard uncertainty of a source.
     moved = found.covariance[:free] / found.noise @ sums.gram[:, sums.columns + 1 :]
     covariance, names = found.covariance[:free, :free], (*sources, *[HELD] * 2 * len(held))
-    by_source = open_.by_source(fit.names, covariance, names, moved)
-    at = stand.at.moved(fit.names, found.step)
+    by_source = open_.by_source(fit.dofs.fitted, covariance, names, moved)
+    at = stand.at.moved(fit.dofs.fitted, found.step)
     return Registration(
         surface=at.of(fit.surface),
         placement=at,

@@ -11,6 +11,7 @@ import struct
 import warnings
 import zipfile
 from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -288,9 +289,17 @@ def read_foreign(
 def _by_topography(
     topography: Any, path: Path, units: LengthUnits | None, channel: str | None, what: str
 ) -> MeasuredPoints:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of missing values, which are checked below
-        with topography.open_topography(str(path)) as reader:
+    # It prints what it cannot decode, and warns of missing values, which are checked below.
+    with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        try:
+            opened = topography.open_topography(str(path))
+        except topography.Exceptions.CannotDetectFileFormat as err:  # a list of all its readers
+            raise FileError(
+                f"{what} is damaged or cut short, or none of the formats that SurfaceTopography "
+                "reads; save it again, uncompressed, or convert it to xyz"
+            ) from err
+        with opened as reader:
             names = [str(one.name) for one in reader.channels]
             holds = [*map(_holds_heights, reader.channels)]
             chosen = chosen_channel(names, channel, holds.index(True) if True in holds else 0, what)

@@ -19,6 +19,10 @@ from omsm_ros.units import LengthUnits
 SLOPES, SIZES, PLACES = (3e-3, -1e-3), (40.0, 15.0), (20, 5)
 
 
+class UnknownError(Exception):
+    """Of a format that no reader knows."""
+
+
 @pytest.fixture
 def map_of(tmp_path, monkeypatch):
     """A file that the library takes for a map, whose heights begin with the direction x."""
@@ -39,7 +43,10 @@ def map_of(tmp_path, monkeypatch):
         channels = [SimpleNamespace(name=n, data_kind=SimpleNamespace(name=k)) for n, k in names]
         opened = type(reader, (), {})()
         opened.topography, opened.channels = topography, channels
-        library = SimpleNamespace(open_topography=lambda path: nullcontext(opened))
+        library = SimpleNamespace(
+            open_topography=lambda path: nullcontext(opened),
+            Exceptions=SimpleNamespace(CannotDetectFileFormat=UnknownError),
+        )
         monkeypatch.setitem(sys.modules, "SurfaceTopography", library)
         path = tmp_path / "map.other"
         path.write_bytes(b"\0" * 100)
@@ -66,6 +73,20 @@ def test_pixels_of_nanofocus_are_those_of_a_microscope(map_of, mistaken):
     points = read_points(map_of(reader="NMSReader", sizes=tuple(mistaken * v for v in SIZES)))
     assert np.ptp(points.x) == pytest.approx(38e-6)
     assert np.ptp(points.y) == pytest.approx(12e-6)
+
+
+def test_a_format_that_no_reader_knows_is_one_sentence(map_of, capfd):
+    path, library = map_of(), sys.modules["SurfaceTopography"]
+
+    def opened(path):
+        print("could not reshape data")
+        raise UnknownError("\n".join(f"tried Reader{k}: wrong magic" for k in range(40)))
+
+    library.open_topography = opened
+    with pytest.raises(FileError, match="damaged or cut short, or none of the formats") as caught:
+        read_points(path)
+    assert "tried" not in str(caught.value)
+    assert capfd.readouterr().out == ""  # it belongs to the JSON of the command
 
 
 def test_lost_places_are_no_points(map_of):
