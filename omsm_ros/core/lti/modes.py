@@ -321,15 +321,11 @@ def response_features(dynamics: TransferFunction, up_to: float) -> dict[str, flo
     gain = np.abs(dynamics.response(frequency)) / abs(dynamics.dc_gain)
     found: dict[str, float | None] = {}
     for name, sign in (("resonance", 1), ("minimum", -1)):
-        peak = _highest_peak(sign * np.log(gain))
+        peaks, _ = scipy.signal.find_peaks(sign * np.log(gain), prominence=_LEAST_PROMINENCE)
+        peak = peaks[np.argmax(sign * gain[peaks])] if len(peaks) else None
         found[name] = None if peak is None else float(frequency[peak])
         found[f"{name}_gain"] = None if peak is None else float(gain[peak])
     for name, inside in (("3db", np.log(10 ** (3 / 20))), ("1_percent", -np.log(0.99))):
         outside = np.flatnonzero(np.abs(np.log(gain)) > inside)
         found[f"bandwidth_{name}"] = float(frequency[outside[0]]) if len(outside) else None
     return found
-
-
-def _highest_peak(values: FloatArray) -> int | None:
-    peaks, _ = scipy.signal.find_peaks(values, prominence=_LEAST_PROMINENCE)
-    return int(peaks[np.argmax(values[peaks])]) if len(peaks) else None

@@ -225,7 +225,8 @@ def _undetected_terms(
     fitted, term, score = diagnostics.fitted, judged.term, judged.score
     shift = omission_shift(diagnostics, term.columns[:, 0])
     frequency, rms = use.frequencies_hz, use.rms_m
-    collinear = _relative(fitted, frequency, shift)
+    real, imaginary = relative_response_jacobian(fitted.dynamics, frequency) @ shift
+    collinear = real + 1j * imaginary
     remaining = collinear - _response_error(term.family, term.parameter, term.damping, frequency)
     # Fitted coefficients cannot follow the resonance of a lightly damped mode.
     whole = term.family == CREEP or _hinted_by_data(judged)
@@ -258,11 +259,6 @@ def _response_error(
         s = s / (2 * np.pi * parameter)
         return np.asarray(1 / (1 + 2 * damping * s + s * s) - 1)
     return np.zeros(len(frequency), np.complex128)
-
-
-def _relative(fitted: Fit, frequency: FloatArray, shift: FloatArray) -> FloatArray:
-    real, imaginary = relative_response_jacobian(fitted.dynamics, frequency) @ shift
-    return np.asarray(real + 1j * imaginary)
 
 
 def omission_shift(diagnostics: ResidualDiagnostics, column: FloatArray) -> FloatArray:
