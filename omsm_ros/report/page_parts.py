@@ -20,17 +20,19 @@ _JOINED = re.compile(
 )
 
 
+_ENVIRONMENT = jinja2.Environment(  # it keeps the templates that it has compiled
+    loader=jinja2.PackageLoader("omsm_ros.report"),
+    autoescape=True,
+    undefined=jinja2.StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    finalize=lambda value: typeset(value) if type(value) is str else value,
+)
+
+
 def fill(template: str, **content: object) -> str:
     """Return the template filled with ``content``, texts escaped; raise for an undefined name."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("omsm_ros.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        finalize=lambda value: typeset(value) if type(value) is str else value,
-    )
-    return environment.get_template(template).render(**content)
+    return _ENVIRONMENT.get_template(template).render(**content)
 
 
 _ORIGINS = (
