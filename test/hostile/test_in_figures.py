@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 
 import pytest
-from hostile.judge import Case, ask, ask_process, judge
+from hostile.judge import Case, ask, judge
 from soaked import soaked
 
 from omsm_ros.io.bag_writer import BagWriter
@@ -31,7 +31,7 @@ def test_a_machine_may_have_any_name(tmp_path: Path, true_calibration, name):
     named = dataclasses.replace(true_calibration, settings={"machine": name})
     save_calibration(tmp_path / "cal.json", named)
     words = ("history", "--catalogue", "c.sqlite", "--add", "cal.json", "--plot", "p.png", "--json")
-    answer = ask_process(Case(words), tmp_path)
+    answer = ask(Case(words), tmp_path)
     assert (answer.status, answer.err) == (0, "")
     judge(Case(words), answer, tmp_path)
 

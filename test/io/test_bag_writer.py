@@ -17,6 +17,7 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from rosbags.interfaces import QosDurability, QosHistory, QosReliability
 from rosbags.rosbag2 import Reader
+from soaked import soaked
 
 from omsm_ros.errors import BagError
 from omsm_ros.io import bag_writer, bags
@@ -145,7 +146,8 @@ def test_what_was_written_stays_however_the_writing_ends(tmp_path, axes, reason)
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_killed_writer_leaves_all_that_was_flushed(tmp_path):
+@pytest.mark.parametrize("times", [2, *soaked(20)])
+def test_a_killed_writer_leaves_all_that_was_flushed(tmp_path, times):
     """Another process, killed in the middle of writing, at a moment that nobody chose."""
     path = tmp_path / "scan.mcap"
     program = textwrap.dedent(
@@ -164,7 +166,7 @@ def test_a_killed_writer_leaves_all_that_was_flushed(tmp_path):
             print(n, flush=True)
         """
     )
-    for _ in range(5):
+    for _ in range(times):
         path.unlink(missing_ok=True)
         with subprocess.Popen(
             [sys.executable, "-c", program, str(path)], stdout=subprocess.PIPE, text=True

@@ -57,7 +57,10 @@ def assert_plain_method_agrees(plan):
     assert abs(np.mean(off)) < 1e-9
 
 
-@pytest.mark.parametrize("device", ["six_channel", *soaked("six_channel", *OTHERS)])
+PROCESSES = pytest.param("six_channel", id="processes", marks=pytest.mark.soak)
+
+
+@pytest.mark.parametrize("device", ["six_channel", PROCESSES, *soaked(*OTHERS)])
 def test_calibrate_scan_correct_and_replay(cell, device):
     plan = demonstration.Demonstration(
         cell.folder / "demo",

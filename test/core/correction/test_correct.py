@@ -102,7 +102,7 @@ def test_geometry_moves_the_points(quiet_scan: Recording) -> None:
 # The same bits, live and offline.
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(
     axis_cuts=st.lists(st.integers(1, 3999), max_size=60),
     probe_cuts=st.lists(st.integers(1, 3999), max_size=60),

@@ -154,7 +154,7 @@ def test_a_refused_block_leaves_the_account_as_it_was(scan: Recording) -> None:
     assert corrector.account == Account()
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(data=st.data())
 def test_whatever_the_network_does_every_sample_is_counted_and_no_point_is_wrong(
     scan: Recording, data: st.DataObject

@@ -13,7 +13,7 @@ from omsm_ros.core.streams.stamps import StampHistory
 
 from .test_slips import Device, join, without
 
-MINUTE = np.arange(60_000)
+HALF_A_MINUTE = np.arange(30_000)
 Blocks = Sequence[tuple[AxisBlock, np.ndarray]]
 
 
@@ -44,12 +44,13 @@ def moved(blocks: Blocks, since: int, by_ns: int) -> list[tuple[AxisBlock, np.nd
 
 
 def two(jitter: float | None = 2e-5, lengths: tuple[int, int] = (100, 64)) -> tuple[Blocks, Blocks]:
-    axes = Device(MINUTE, lengths[0], jitter=jitter, seed=1, regressed=False).blocks()
-    return axes, Device(MINUTE, lengths[1], jitter=jitter, seed=2, regressed=False).blocks()
+    axes = Device(HALF_A_MINUTE, lengths[0], jitter=jitter, seed=1, regressed=False).blocks()
+    probe = Device(HALF_A_MINUTE, lengths[1], jitter=jitter, seed=2, regressed=False)
+    return axes, probe.blocks()
 
 
 def slipped() -> tuple[Blocks, Blocks]:
-    probe = Device(without(MINUTE, 31_111, 3), 64, jitter=2e-5, seed=2, regressed=False)
+    probe = Device(without(HALF_A_MINUTE, 15_111, 3), 64, jitter=2e-5, seed=2, regressed=False)
     return two()[0], probe.blocks()
 
 
@@ -60,13 +61,13 @@ def lost() -> tuple[Blocks, Blocks]:
 
 def paused() -> tuple[Blocks, Blocks]:
     axes, probe = two()
-    return moved(axes, 24_000, 3 * 10**9), moved(probe, 24_000, 3 * 10**9)
+    return moved(axes, 12_000, 3 * 10**9), moved(probe, 12_000, 3 * 10**9)
 
 
 def parted() -> tuple[Blocks, Blocks]:
     """One driver's, until the clock of one stream steps by less than what is a slip."""
     axes, probe = two(None, (100, 100))
-    return axes, moved(probe, 30_000, 100_000)
+    return axes, moved(probe, 15_000, 100_000)
 
 
 RECORDINGS: dict[str, Callable[[], tuple[Blocks, Blocks]]] = {
