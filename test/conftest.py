@@ -3,6 +3,7 @@
 The order of tests: several processes share the test files, and files with nodes mostly wait.
 """
 
+import gc
 import signal
 
 import hypothesis
@@ -28,6 +29,12 @@ def pytest_configure():
     pytest.approx = approx
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    gc.disable()  # of half a million objects of the collected tests, none is garbage
+
+
+def pytest_collection_finish():
+    gc.freeze()  # nor is it looked for while they run
+    gc.enable()
 
 
 _APPROX = pytest.approx
@@ -53,9 +60,9 @@ SMALL = Scenario(start_radius=2e-3)
 
 def pytest_collection_modifyitems(items):
     """Spread the files with nodes evenly among the others; the hour of real time begins first."""
-    place = {}
+    place, paths = {}, {item.path for item in items}
     for with_nodes in (True, False):
-        files = sorted({i.path for i in items if (i.path.parent.name == "system") is with_nodes})
+        files = sorted(p for p in paths if (p.parent.name == "system") is with_nodes)
         place |= {file: k / len(files) for k, file in enumerate(files)}
     items.sort(key=lambda item: (item.path.name != "test_soak.py", place[item.path]))
 
