@@ -22,7 +22,8 @@ def planned(capsys, *words):
 
 
 def test_the_shortest_verifiable_set_that_reaches_is_chosen(capsys, nominal, tmp_path):
-    found = planned(capsys, "--nominal", nominal, "--out", tmp_path, "--accuracy", 100e-9)
+    words = ("--nominal", nominal, "--out", tmp_path, "--accuracy", 100e-9, "--radius", 8e-3)
+    found = planned(capsys, *words)
     assert found["reaches"]
     chosen, *others = found["sets"]
     assert found["set"] == chosen["name"]

@@ -120,8 +120,9 @@ def filled_in(command):
 
 
 @functools.cache
-def parser_of_word(word):
-    return parser_of([word])
+def parser():
+    """Return the parser of all commands."""
+    return parser_of(WORDS)
 
 
 def is_name(command):
@@ -132,7 +133,7 @@ def is_name(command):
     if program != "omsm" or word not in WORDS:
         return False
     try:
-        parser_of_word(word).parse_args(filled_in(command).split(" > ")[0].split()[1:])
+        parser().parse_args(filled_in(command).split(" > ")[0].split()[1:])
     except OmsmError:
         options = [r for r in rest if r.startswith("--")]
         return len(rest) <= 3 and len(options) <= 1

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 import omsm_ros
-from omsm_ros.cli.command_line import parser_of
 from omsm_ros.cli.words import WORDS
+
+from .pages import parser
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -42,7 +43,7 @@ def options(word):
 
 
 def _parser(word):
-    (commands,) = [a for a in parser_of([word])._actions if hasattr(a.choices, "get")]
+    (commands,) = [a for a in parser()._actions if hasattr(a.choices, "get")]
     return commands.choices[word]
 
 

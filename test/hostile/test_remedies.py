@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import omsm_ros
@@ -34,7 +35,12 @@ def wording(node):
     return HOLE
 
 
+@cache
 def messages():
+    return list(_messages())
+
+
+def _messages():
     for path in sorted(path for room in ROOMS for path in (HOME / room).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if not (isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call)):
