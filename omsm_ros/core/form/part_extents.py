@@ -36,16 +36,17 @@ from omsm_ros.core.form.zernike_fit import ZernikeFit, continued, fit_zernikes, 
 from omsm_ros.core.registration.pose_parameters import root_of
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
-from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
+from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 
 # 99.5 % of the area lies between these (ISO 10110-5:2015 calls for a share to be stated).
 ROBUST = (0.0025, 0.9975)
+# Turning and polishing make rings and rolled edges, so that symmetric terms have higher orders.
+_TERMS = terms_up_to(16) + tuple(ZernikeIndex(n, 0) for n in range(18, 32, 2))
 # Orders of the smooth terms; the highest with forty points for each term is used.
-_ORDERS, _POINTS_PER_TERM = (12, 8, 4, 2), 40
+_ORDERS, _PER_TERM = (30, 16, 12, 8, 4, 2), 40
 # Condition number that leaves nine digits of the sum of the terms at points that were fitted.
 _CONDITION = 1e7
-# Two hundred points for each of the 91 terms up to order 12; two thousand show the extent of a
-# smooth form.
+# A hundred points for each term; two thousand show the extent of a smooth form.
 _MOST_FITTED, _MOST_DRAWN = 20_000, 2_000
 # Noise adds to an extent with the first power of its size where many points compete for it, with
 # the second where one has it. The middle is used, the others are limits of a uniform error.
@@ -448,21 +449,21 @@ def _beyond_chance(count: int) -> float:
 
 def _smooth(map_: DeviationMap, disc: Aperture) -> ZernikeFit:
     """Return smooth terms of the deviations, of as high an order as the points show."""
-    orders = [n for n in _ORDERS if len(terms_up_to(n)) * _POINTS_PER_TERM <= len(map_)] or [0]
-    every = terms_up_to(orders[0])
+    orders = [n for n in _ORDERS if _PER_TERM * sum(t.n <= n for t in _TERMS) <= len(map_)] or [0]
+    every = [term for term in _TERMS if term.n <= orders[0]]
     weighted = (columns := zernike_values(*disc.scaled(map_.x, map_.y), every)) * map_.area
     gram, squares = weighted @ columns.T, weighted @ weighted.T
     right = weighted @ map_.deviation
     for order, lower in zip(orders, [*orders[1:], -1], strict=True):
-        terms = terms_up_to(order)
+        terms = [term for term in every if term.n <= order]
         kept = separable(gram[: len(terms), : len(terms)], terms, _CONDITION)
         # Orders that only follow the noise would blur the rim, where the noise of all adds up.
         solve = np.linalg.inv(gram[np.ix_(kept, kept)])[[terms[k].n > lower for k in kept]]
         covariance = map_.noise**2 * solve @ squares[np.ix_(kept, kept)] @ solve.T
         # Wald's test, because where the points leave parts of the disc out the terms are alike.
-        count, found = len(solve), solve @ right[kept]
-        chi_square = float(found @ np.linalg.solve(covariance + _TINY * np.eye(count), found))
-        if chi_square > count + _CHANCE * np.sqrt(2 * count):
+        free, found = len(solve), solve @ right[kept]
+        chi_square = float(found @ np.linalg.solve(covariance + _TINY * np.eye(free), found))
+        if chi_square > free + _CHANCE * np.sqrt(2 * free):
             break
     points = (map_.x, map_.y, map_.deviation)
     return fit_zernikes(*points, terms, disc, weights=map_.area, condition=_CONDITION)

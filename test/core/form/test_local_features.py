@@ -83,6 +83,26 @@ def test_a_rolled_edge_beyond_the_last_whole_turn_belongs_to_the_figures(turns):
         assert rms.uncertainty < 0.05 * true
 
 
+def test_a_rolled_edge_on_a_dense_map_is_no_higher_than_it_is():
+    """Terms up to order 12 swing about an edge that falls within an eighth of the radius."""
+    line = np.linspace(-R, R, 220)
+    x, y = (v.ravel() for v in np.meshgrid(line, line))
+    x, y = (v[np.hypot(x, y) <= R] for v in (x, y))
+    far, random = np.hypot(x, y) / R, np.random.default_rng(3)
+    form = (
+        -170e-9 * np.clip((far - 0.875) / 0.125, 0, None) ** 1.44 + 20e-9 * (x * x - y * y) / R**2
+    )
+    off, disc = [], Aperture(float(np.hypot(x, y).max()))
+    for _ in range(3):
+        map_ = DeviationMap(x=x, y=y, deviation=form + random.normal(0, 3e-9, len(x)), noise=3e-9,
+                            area=np.ones(len(x)), effects=np.empty((0, len(x))))  # fmt: skip
+        whole = extents_of_parts([map_], disc, disc, line[1] - line[0])[0][0]
+        # From the flank of the saddle within the fall to its other side at the rim.
+        off.append((whole.value - 205.3e-9) / whole.uncertainty)
+        assert whole.uncertainty < 3e-9
+    assert np.sqrt(np.mean(np.square(off))) < 2
+
+
 @pytest.mark.parametrize("along", [1.0, 3.0])
 @pytest.mark.parametrize(("off", "bow"), [(0.0, 0.0), (0.25, 0.0), (0.5, 0.0), (0.5, 250e-9)])
 def test_a_summit_between_two_tracks_belongs_to_the_figure(along, off, bow):
