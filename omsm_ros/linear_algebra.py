@@ -16,6 +16,8 @@ FloatArray = NDArray[np.float64]
 # Rows and values of a matrix held in memory at a time, where a long record is processed in blocks:
 # half a megabyte a column, 32 MB in all.
 BLOCK_ROWS, BLOCK_VALUES = 65_536, 4_000_000
+# Directions of products of columns weaker than this part of the strongest are rounding.
+ROUNDING = 1e-13
 
 
 def unit_columns(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -43,6 +45,16 @@ def orthonormal(columns: FloatArray, tolerance: float) -> FloatArray:
     """
     left, values, _ = np.linalg.svd(unit_columns(columns)[0], full_matrices=False)
     return np.asarray(left[:, values > tolerance * values[0]])
+
+
+def inverse_gram(gram: FloatArray) -> FloatArray:
+    """Return the pseudoinverse of products of columns (q, q), without what is rounding."""
+    scale = np.sqrt(np.maximum(np.diag(gram), 0.0))  # rounding may leave less than nothing
+    scale[scale == 0] = 1.0
+    values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
+    kept = values > ROUNDING * values[-1]
+    root = directions[:, kept] / np.sqrt(values[kept]) / scale[:, np.newaxis]
+    return np.asarray(root @ root.T)
 
 
 def triangle(*parts: FloatArray) -> FloatArray:

@@ -76,22 +76,20 @@ class EvaluationBudget:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """The residual (k,) at one ψ, ``nonlinear``, and the linear parameters (m + 1 + q,) there."""
+    """The residual (k,) at one ψ, ``nonlinear``, and the linear parameters (m + 1 + q,) there.
+
+    normal: computes half the slope of the sum of squares (len ψ,) and its curvature
+    """
 
     nonlinear: FloatArray
     residual: FloatArray
     linear: FloatArray
-    derivative: Callable[[], FloatArray]
-
-    @cached_property
-    def jacobian(self) -> FloatArray:
-        """Derivative of the residual by ψ, (k, len ψ), computed when a step starts here."""
-        return self.derivative()
+    normal: Callable[[], tuple[FloatArray, FloatArray]]
 
     @cached_property
     def normal_equations(self) -> tuple[FloatArray, FloatArray]:
-        """Return half the slope of the sum of squares (len ψ,) and its curvature."""
-        return self.jacobian.T @ self.residual, self.jacobian.T @ self.jacobian
+        """Return ``normal()``, computed when a step starts here."""
+        return self.normal()
 
 
 Project = Callable[[FloatArray], Projection]
@@ -117,7 +115,7 @@ def descend(project: Project, start: Projection, box: Box, evaluations: int) -> 
         slope, curvature = at.normal_equations
         # A parameter at its bound whose step would leave the box is fixed.
         free = ~(((nonlinear <= lower) & (slope > 0)) | ((nonlinear >= upper) & (slope < 0)))
-        scale = np.sqrt(np.diag(curvature))
+        scale = np.sqrt(np.maximum(np.diag(curvature), 0.0))
         free &= scale > _INSENSITIVE * np.max(scale)
         if not np.any(free):
             break

@@ -21,11 +21,11 @@ from numpy.polynomial import polynomial
 from scipy import fft, linalg, ndimage
 
 from omsm_ros.core.estimation.model_structure import ScaledStructure
-from omsm_ros.core.estimation.optimisation import EvaluationBudget, Projection, descend
+from omsm_ros.core.estimation.optimisation import EvaluationBudget, Project, Projection, descend
 from omsm_ros.core.kinematics.trajectories import s_curve
 from omsm_ros.core.lti.transfer_function import ComplexArray, Structure, TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
-from omsm_ros.linear_algebra import BLOCK_VALUES, least_squares
+from omsm_ros.linear_algebra import BLOCK_VALUES, inverse_gram, least_squares
 
 # Duration of the bridge: across the whole travel it adds nothing near the fastest motion.
 _BRIDGE_S = 0.3
@@ -81,6 +81,8 @@ _RACE_EVALUATIONS = 5
 _FINISH_EVALUATIONS = 60
 # Radians a sample, thirty times half the sampling rate: a faster pole would be no other model.
 _FASTEST = 100.0
+# Largest share of a period that is not compared where products are summed over lines.
+_FEW_MISSING = 0.25
 # Exponent of e to which the pulse before a record has decayed where its band ends.
 _PULSE_END = 14.0
 
@@ -202,24 +204,26 @@ class Problem:
 
     @cached_property
     def _target(self) -> FloatArray:
-        return self.output[self.used]
+        return self.output[self._kept]
 
     @cached_property
-    def _places(self) -> IntArray:
-        return np.flatnonzero(self.used)
+    def _kept(self) -> slice | IntArray:
+        """Places of the compared samples, without a copy where no sample between them is lost."""
+        places = np.flatnonzero(self.used)
+        whole = len(places) > 0 and places[-1] - places[0] < len(places)
+        return slice(int(places[0]), int(places[-1]) + 1) if whole else places
 
     @cached_property
     def _fixed(self) -> FloatArray:
-        return self.background[self.used]
+        return self.background[self._kept]
 
     def _in_time(self, spectra: ComplexArray) -> FloatArray:
-        found = np.empty((len(spectra), len(self._places)))
+        found = np.empty((len(spectra), len(self._target)))
         # In blocks: all at once would double the memory of a long record.
         step = max(BLOCK_VALUES // self.closed_length, 1)
         for first in range(0, len(spectra), step):
             part = slice(first, first + step)
-            values = fft.irfft(spectra[part], self.closed_length, axis=-1)
-            np.take(values, self._places, axis=-1, out=found[part])
+            found[part] = fft.irfft(spectra[part], self.closed_length, axis=-1)[:, self._kept]
         return found
 
     def project(self, scaled: ScaledStructure, nonlinear: FloatArray) -> Projection:
@@ -234,13 +238,88 @@ class Problem:
         linear = least_squares(triangle[:size, :size], triangle[:size, size], _RANK_TOLERANCE)
         residual = self._target - columns[:, :size] @ linear
 
-        def derivative() -> FloatArray:
+        def normal() -> tuple[FloatArray, FloatArray]:
             basis = linalg.lapack.dorgqr(packed[:, :size], factors[:size], lwork=_BLOCK * size)[0]
             answer = self._answer(structure, lag, linear[: len(moved)])
             slopes = self._in_time(scaled.lag_slopes(nonlinear, self.s) * answer).T
-            return np.asarray(basis @ (basis.T @ slopes) - slopes)
+            jacobian = basis @ (basis.T @ slopes) - slopes
+            return jacobian.T @ residual, jacobian.T @ jacobian
 
-        return Projection(nonlinear, residual, linear, derivative)
+        return Projection(nonlinear, residual, linear, normal)
+
+    @cached_property
+    def _weights(self) -> FloatArray:
+        """Roots of the weights (k,) of lines by which their products sum as those in time do."""
+        weights = np.full(len(self.s), np.sqrt(2 / self.closed_length))
+        weights[0] /= np.sqrt(2)
+        if 2 * len(self.s) == self.closed_length + 2:
+            weights[-1] /= np.sqrt(2)
+        return weights
+
+    def _lines(self, spectra: ComplexArray) -> FloatArray:
+        """Return ``spectra`` (…, k), real and imaginary parts side by side, weighted (…, 2k)."""
+        found = (spectra * self._weights).view(np.float64)
+        if 2 * len(self.s) == self.closed_length + 2:
+            found[..., -1] = 0.0  # the line at half the sampling rate is real
+        return np.asarray(found)
+
+    def _compared_lines(self, values: FloatArray) -> FloatArray:
+        """Return ``values`` (k,) of the compared samples, 0 elsewhere, as :meth:`_lines`."""
+        return self._lines(self.padded_spectrum(self.on_grid(values, 0.0)))
+
+    @cached_property
+    def _background_lines(self) -> FloatArray:
+        return np.array([self._compared_lines(column) for column in self._fixed.T])
+
+    @property
+    def few_missing(self) -> bool:
+        """Return whether little of the period is not compared, and no response starts there."""
+        missing = 1 - len(self._target) / self.closed_length
+        return missing < _FEW_MISSING and not self.fits_initial_condition
+
+    @cached_property
+    def _filled(self) -> FloatArray:
+        """Lines of the output where it is compared, and of the motion times the gain elsewhere."""
+        moved = self.motion[self._kept]
+        gain = least_squares(np.column_stack([moved, self._fixed]), self._target)[0]
+        left = self._compared_lines(self._target - gain * moved)
+        return left + gain * self._lines(self._spectrum)
+
+    def by_lines(self, scaled: ScaledStructure) -> Project:
+        """Return a projection as :meth:`project` whose products are sums over lines of spectra.
+
+        What is not compared is filled in with the last model a step started from (expectation
+        maximisation, Dempster et al. 1977): the sum of squares is exact, the linear parameters are
+        the best ones once the descent has come to rest. The first model is the static gain.
+        """
+        structure, filled = scaled.structure, self._filled
+        gram_fixed, fixed_target = (self._fixed.T @ v for v in (self._fixed, self._target))
+        terms = sum(count for _, count in self.drives(structure))
+
+        def project(nonlinear: FloatArray) -> Projection:
+            lag = scaled.lag(nonlinear, self.s)
+            rows = self._lines(self._driven(structure, lag))
+            cross = rows @ self._background_lines.T
+            gram = np.block([[rows @ rows.T, cross], [cross.T, gram_fixed]])
+            inverse = inverse_gram(gram)
+            linear = inverse @ np.concatenate([rows @ filled, fixed_target])
+            answer = self._answer(structure, lag, linear[:terms])
+            moved = self._in_time(answer[np.newaxis])[0]
+            residual = self._target - self._fixed @ linear[terms:] - moved
+
+            def normal() -> tuple[FloatArray, FloatArray]:
+                nonlocal filled
+                left = self._compared_lines(residual)
+                filled = left + linear[:terms] @ rows + linear[terms:] @ self._background_lines
+                slopes = self._lines(scaled.lag_slopes(nonlinear, self.s) * answer)
+                taken = np.hstack([slopes @ rows.T, slopes @ self._background_lines.T]) @ inverse
+                missed = np.concatenate([rows @ left, self._fixed.T @ residual])
+                curvature = slopes @ slopes.T - taken @ gram @ taken.T
+                return taken @ missed - slopes @ left, curvature
+
+            return Projection(nonlinear, residual, linear, normal)
+
+        return project
 
     def _answer(
         self, structure: Structure, lag: ComplexArray, coefficients: FloatArray
@@ -307,7 +386,7 @@ class Problem:
     def _with_background_columns(self, spectra: Sequence[ComplexArray]) -> FloatArray:
         """Return columns (k, …) of all ``spectra`` (…, k), then those of the background."""
         count = sum(map(len, spectra))
-        rows = np.empty((count + self.background.shape[1], len(self._places)))
+        rows = np.empty((count + self.background.shape[1], len(self._target)))
         rows[count:] = self._fixed.T
         first = 0
         for part in spectra:
@@ -401,9 +480,10 @@ def fit(
     def project(nonlinear: FloatArray) -> Projection:
         if budget is not None:
             budget.count(int(np.count_nonzero(problem.used)), structure.poles)
-        return problem.project(scaled, nonlinear)
+        return by_lines(nonlinear) if by_lines else problem.project(scaled, nonlinear)
 
     best, least = None, np.inf
+    by_lines = problem.by_lines(scaled) if problem.few_missing else None
     for start in starts:
         found = descend(project, project(np.clip(start, *box)), box, _RACE_EVALUATIONS)
         cost = float(np.sum(found.residual**2))
@@ -411,7 +491,7 @@ def fit(
             best, least = found, cost
     if best is None:
         raise ValueError("no start to fit from, expected one or more")
-    return _fit_at(problem, scaled, descend(project, best, box, evaluations))
+    return evaluated(problem, structure, descend(project, best, box, evaluations).nonlinear)
 
 
 def evaluated(problem: Problem, structure: Structure, nonlinear: FloatArray) -> Fit:

@@ -32,11 +32,10 @@ from omsm_ros.core.estimation.parallel_sections import (
 )
 from omsm_ros.core.lti.transfer_function import ComplexArray, Structure
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
+from omsm_ros.linear_algebra import ROUNDING, inverse_gram
 
 # Unit of w inside a fit, in 1/T: the middle of the range of sampled poles.
 RATE = 0.5
-# Directions of the linear columns weaker than this part of the strongest are rounding.
-_RANK_TOLERANCE = 1e-13
 # Least share of the largest power at which a line is excited.
 _EXCITED = 1e-3
 # Most lines of one record for vector fitting, evenly among the excited ones.
@@ -253,19 +252,22 @@ class SectionsProblem:
             targets.append(one.output - free @ (free.T @ one.output))
             frees.append(free)
         target = np.concatenate(targets)
-        inverse = _inverse(every @ every.T)
+        inverse = inverse_gram(every @ every.T)
         linear = inverse @ (every @ target)
         # Refined once, because the inverse has the squared condition of the columns.
         linear += inverse @ (every @ (target - linear @ every))
         found = linear.reshape(self.inputs, -1)
 
-        def derivative() -> FloatArray:
+        residual = target - linear @ every
+
+        def normal() -> tuple[FloatArray, FloatArray]:
             parts = zip(self.spectra, frees, strict=True)
             slopes = [self._slopes(*part, nonlinear, order, found) for part in parts]
             every_slope = np.concatenate(slopes, axis=1)
-            return np.asarray(((every_slope @ every.T) @ inverse @ every - every_slope).T)
+            free = (every_slope @ every.T) @ inverse @ every - every_slope
+            return free @ residual, free @ free.T
 
-        return Projection(nonlinear, target - linear @ every, np.ravel(found), derivative)
+        return Projection(nonlinear, residual, np.ravel(found), normal)
 
     def _slopes(
         self, one: _Spectra, free: FloatArray, nonlinear: FloatArray, order: int, linear: FloatArray
@@ -344,7 +346,7 @@ class SectionsProblem:
         scale[scale == 0] = 1.0
         values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
         # A direction lost in rounding is as uncertain as the weakest.
-        values = np.maximum(values, _RANK_TOLERANCE * values[-1])
+        values = np.maximum(values, ROUNDING * values[-1])
         root = directions / np.sqrt(values) / scale[:, np.newaxis]
         score, start = np.zeros_like(gram), 0
         for one, free in zip(self.spectra, frees, strict=True):
@@ -437,7 +439,7 @@ def _missing_pairs(problem: SectionsProblem, fitted: SectionsFit, count: int) ->
         for damping in _ADDED_DAMPINGS:
             basis = basis_of(np.array([[2 * damping / rate, 1 / rate**2]]), one.w)[1:]
             rows = _stacked((drives * basis).reshape(-1, len(one.w)))
-            tried.append((rate * (1j - damping), rows, _inverse(rows @ rows.T)))
+            tried.append((rate * (1j - damping), rows, inverse_gram(rows @ rows.T)))
     left, found = _stacked(spectrum[np.newaxis])[0], []
     for _ in range(count if tried else 0):
         along = [rows @ left for _, rows, _ in tried]
@@ -446,16 +448,6 @@ def _missing_pairs(problem: SectionsProblem, fitted: SectionsFit, count: int) ->
         left = left - (inverse @ along[best]) @ rows
         found.append(pole)
     return np.array(found, np.complex128)
-
-
-def _inverse(gram: FloatArray) -> FloatArray:
-    """Return the inverse of the products of columns, without directions that are rounding."""
-    scale = np.sqrt(np.maximum(np.diag(gram), 0.0))  # rounding may leave less than nothing
-    scale[scale == 0] = 1.0
-    values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
-    kept = values > _RANK_TOLERANCE * values[-1]
-    root = directions[:, kept] / np.sqrt(values[kept]) / scale[:, np.newaxis]
-    return np.asarray(root @ root.T)
 
 
 def _relocate(
@@ -474,9 +466,9 @@ def _relocate(
         (own, cross), (_, shared) = (
             np.split(p, [len(free)], 1) for p in np.split(rows @ rows.T, [len(free)])
         )
-        grams.append(shared - cross.T @ _inverse(own) @ cross)
+        grams.append(shared - cross.T @ inverse_gram(own) @ cross)
     gram = np.sum(grams, axis=0)
-    solved = _inverse(gram[:-1, :-1]) @ gram[:-1, -1]
+    solved = inverse_gram(gram[:-1, :-1]) @ gram[:-1, -1]
     blocks = [[[p.real, p.imag], [-p.imag, p.real]] for p in upper]
     a = linalg.block_diag(*blocks, *([[p]] for p in real))
     b = np.concatenate([np.tile([2.0, 0.0], len(upper)), np.ones(len(real))])

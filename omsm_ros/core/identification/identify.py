@@ -23,6 +23,7 @@ from itertools import pairwise
 from typing import Any, ParamSpec
 
 import numpy as np
+from scipy import linalg
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import (
@@ -74,7 +75,7 @@ from omsm_ros.core.lti.modes import (
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.model_errors.families import DRIFT
 from omsm_ros.core.model_errors.residual_diagnostics import Contrast, contrasts
-from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, IdentificationError, StepTestError
 from omsm_ros.linear_algebra import one_blas_thread, unit_columns
@@ -467,23 +468,31 @@ def _ratio(
     moved = [motion[known] - motion[known].mean() for motion in (travel, *further)]
     columns = np.column_stack([*moved, *each]).astype(np.float64)
     unit, scale = unit_columns(columns)
-    walk = sum(np.minimum.outer(t, t) / t[-1] * np.outer(one, one) for one in own)
-    tried = [_weighted(unit, y, np.eye(len(y)) + share * walk) for share in _WALK_SHARES]
+    first = np.diff(part[known], prepend=-1) != 0
+    walked = np.where(first, t, np.diff(t, prepend=0.0)) / t[-1]
+    tried = [_weighted(unit, y, first, share * walked) for share in _WALK_SHARES]
     _, solved, uncertainty = max(tried)
     return GainEstimate(abs(solved) / float(scale[0]), uncertainty / float(scale[0]))
 
 
 def _weighted(
-    columns: FloatArray, values: FloatArray, covariance: FloatArray
+    columns: FloatArray, values: FloatArray, first: BoolArray, walked: FloatArray
 ) -> tuple[float, float, float]:
-    """Return the restricted log likelihood, the first coefficient and its standard uncertainty."""
-    factor = np.linalg.cholesky(covariance)
-    both = np.linalg.solve(factor, np.column_stack([columns, values]))
+    """Return the restricted log likelihood, the first coefficient and its standard uncertainty.
+
+    In white noise of variance 1 and a random walk: differences of neighbours have a covariance of
+    three diagonals. first: of a recording (k,);  walked: variance of each step of the walk (k,)
+    """
+    both = np.column_stack([columns, values])
+    both = both - np.where(first[:, np.newaxis], 0.0, np.roll(both, 1, axis=0))
+    bands = np.stack([np.where(first, 1.0, 2.0) + walked, np.append(first[1:] - 1.0, 0.0)])
+    factor = linalg.cholesky_banded(bands, lower=True)
+    both = linalg.solve_banded((1, 0), factor, both)
     q, r = np.linalg.qr(both[:, :-1])
     residual = both[:, -1] - q @ (q.T @ both[:, -1])
     inverse, degrees = np.linalg.pinv(r), max(len(values) - columns.shape[1], 1)
     variance = max(float(residual @ residual) / degrees, float(np.finfo(np.float64).tiny))
-    spread = float(np.sum(np.log(np.diag(factor)))) + float(np.linalg.slogdet(r)[1])
+    spread = float(np.sum(np.log(factor[0]))) + float(np.linalg.slogdet(r)[1])
     return (
         -0.5 * degrees * float(np.log(variance)) - spread,
         float(inverse[0] @ (q.T @ both[:, -1])),

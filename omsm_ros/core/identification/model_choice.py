@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.estimation.model_order import (
+    ENOUGH_SAMPLES,
     Candidate,
     StartingPoints,
     choose,
@@ -21,8 +22,9 @@ from omsm_ros.core.estimation.model_order import (
     information,
 )
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
-from omsm_ros.core.estimation.output_error import Fit, Problem, evaluated, fit
+from omsm_ros.core.estimation.output_error import STATIONARY_S, Fit, Problem, evaluated, fit
 from omsm_ros.core.estimation.preparation import Prepared
+from omsm_ros.core.estimation.steps import extended
 from omsm_ros.core.identification.residual_tests import noise_colour
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.core.model_errors.families import FASTEST_CREEP_S
@@ -96,13 +98,47 @@ def choose_model(
     """
     problem, budget = prepared.problem, budget or EvaluationBudget()
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget)
-    points = StartingPoints(problem, lag)
+    part, found = _excerpt(prepared), list[Fit]()
+    points = StartingPoints(part or problem, lag if part is None else _refitted(part, lag, budget))
 
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
-        return fit(problem, structure, points.of(structure, smaller), budget=budget)
+        if part is None:
+            return fit(problem, structure, points.of(structure, smaller), budget=budget)
+        found.append(fit(part, structure, points.of(structure, found), budget=budget))
+        return _refitted(problem, found[-1], budget)
 
     colour = noise_colour(problem, lag, prepared.steps)
     return _model(problem, explore(fit_structure, order, colour, budget), order)
+
+
+def _refitted(problem: Problem, known: Fit, budget: EvaluationBudget) -> Fit:
+    return fit(problem, known.structure, [known.nonlinear], budget=budget)
+
+
+def _excerpt(prepared: Prepared) -> Problem | None:
+    """Return the first edges of a long step test, in which fits start; rests after them end early.
+
+    None where that would leave out less than half of the record.
+    """
+    problem, moving = prepared.problem, prepared.steps.moving
+    rest = round(STATIONARY_S / problem.period)
+    near = extended(extended(moving, rest)[::-1], rest)[::-1]
+    kept = np.flatnonzero(near)[:ENOUGH_SAMPLES]
+    whole = problem.fits_initial_condition or len(problem.starts) > 1
+    if whole or 2 * len(kept) > len(moving) or np.all(moving[kept]):
+        return None
+    kept = kept[: np.flatnonzero(~moving[kept])[-1] + 1]  # not in the middle of a move
+    return replace(
+        problem,
+        input=problem.input[kept],
+        output=problem.output[kept],
+        used=problem.used[kept],
+        background=problem.background[kept],
+        further=np.array([motion[kept] for motion in problem.further]),
+        plateau=None,
+        errors_in_variables=None,
+        recorded=None,
+    )
 
 
 def rechosen(problem: Problem, before: ChosenModel, budget: EvaluationBudget) -> ChosenModel | None:

@@ -21,7 +21,7 @@ from scipy import fft, signal
 from omsm_ros.core.estimation.output_error import Fit, Problem
 from omsm_ros.core.estimation.steps import Steps
 from omsm_ros.core.lti.transfer_function import ComplexArray
-from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
 
 # Half width of the backlash that removes reversals of noise, in standard deviations. The remaining
 # noise is far smaller than any backlash looked for; a larger width would lose reversals.
@@ -33,36 +33,47 @@ def without_noise(motion: FloatArray, noise: float) -> FloatArray:
     return through_backlash(motion, _NOISE_HALF_GAP * noise) if noise > 0 else motion
 
 
-def through_backlash(motion: FloatArray, half: float) -> FloatArray:
-    """Return the output (n,) of a gap of ±``half`` [m] that ``motion`` (n,) drives."""
+def _turns(motion: FloatArray) -> IntArray:
+    """Return the last index (r,) of each part of ``motion`` (n,) that goes in one direction."""
     change = np.diff(motion, prepend=motion[0])
     moved = np.flatnonzero(change)
-    if len(moved) == 0:
-        return motion.copy()
-    # Only the end of a run in one direction matters.
     back = change[moved] < 0
     turns = moved[np.flatnonzero(back[1:] != back[:-1])]
-    del change, moved  # memory for the rest, in a long record
-    ends = np.append(turns, len(motion) - 1)
+    return np.append(turns, len(motion) - 1)
+
+
+def through_backlash(motion: FloatArray, half: float) -> FloatArray:
+    """Return the output (n,) of a gap of ±``half`` [m] that ``motion`` (n,) drives."""
+    turns = _turns(motion)
+    return _driven(motion, half, motion[turns], turns)
+
+
+def _driven(motion: FloatArray, half: float, turned: FloatArray, turns: IntArray) -> FloatArray:
+    """Return the output (n,) of a gap; ``motion`` turns at values ``turned`` (r,), ``turns``."""
     state, states = float(motion[0]), []
-    for end in motion[ends].tolist():
+    for end in turned.tolist():
         states.append(state)
         state = min(max(state, end - half), end + half)
-    held = np.repeat(states, np.diff(ends, prepend=-1))
+    held = np.repeat(states, np.diff(turns, prepend=-1))
     near = motion - half
     np.maximum(held, near, out=held)
     near += 2 * half
     return np.asarray(np.minimum(held, near, out=held))
 
 
-def backlash_lead(motion: FloatArray, gaps: Sequence[float]) -> Iterator[FloatArray]:
+def backlash_lead(
+    motion: FloatArray, gaps: Sequence[float], every: int = 1
+) -> Iterator[FloatArray]:
     """Yield the lead of ``motion`` (n,) over half of each backlash [m], and its start column.
 
     The start column is for the unknown first position in the backlash, until it is crossed.
+    every: one in so many samples is yielded, though the motion turns at any
     """
-    crossed = np.maximum.accumulate(motion) - np.minimum.accumulate(motion)
+    crossed = (np.maximum.accumulate(motion) - np.minimum.accumulate(motion))[::every]
+    turns = _turns(motion)
+    seen, turned, turns = motion[::every].copy(), motion[turns], turns // every
     for gap in gaps:
-        yield (motion - through_backlash(motion, 0.5 * gap)) / (0.5 * gap)
+        yield (seen - _driven(seen, 0.5 * gap, turned, turns)) / (0.5 * gap)
         yield np.clip(1.0 - crossed / gap, 0.0, 1.0)
 
 
@@ -71,17 +82,18 @@ def dahl_friction(motion: FloatArray, travel: float) -> tuple[FloatArray, FloatA
 
     dF/dx = (1 - F sgn v) / travel (Dahl 1968).
     """
-    change = np.diff(motion, prepend=motion[0])
-    kept, direction = np.exp(-np.abs(change) / travel), np.sign(change)
-    moved = change != 0
+    turns = _turns(motion)
+    begun = np.append(motion[:1], motion[turns[:-1]])
+    ways = np.sign(motion[turns] - begun)
+    kept = np.exp(-np.abs(motion[turns] - begun) / travel)
     value, values = 0.0, []
-    for way, part in zip(direction[moved].tolist(), kept[moved].tolist(), strict=True):
-        value = way + (value - way) * part
+    for way, part in zip(ways.tolist(), kept.tolist(), strict=True):
         values.append(value)
-    force = np.zeros(len(motion))
-    force[moved] = values
-    last = np.maximum.accumulate(np.where(moved, np.arange(len(motion)), 0))
-    return force[last], np.cumprod(kept)
+        value = way + (value - way) * part
+    lengths = np.diff(turns, prepend=-1)
+    begun, ways, first = (np.repeat(each, lengths) for each in (begun, ways, values))
+    force = ways + (first - ways) * np.exp(-np.abs(motion - begun) / travel)
+    return force, np.exp(-np.cumsum(np.abs(np.diff(motion, prepend=motion[0]))) / travel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -400,8 +412,8 @@ class ModelErrorFamilies:
             return
 
         def part(first: int, last: int) -> FloatArray:
-            lost = [c[::_FINER] for c in backlash_lead(turning(), _GAPS_M[first:last])]
-            return -self.fitted.gain * np.column_stack(lost)
+            lost = backlash_lead(turning(), _GAPS_M[first:last], _FINER)
+            return -self.fitted.gain * np.column_stack(list(lost))
 
         yield ModelErrorFamily(BACKLASH, np.asarray(_GAPS_M), 2.0, part, 2)
 

@@ -27,7 +27,13 @@ class Watched:
 
     def __call__(self, psi: FloatArray) -> Projection:
         self.asked.append(psi.copy())
-        return Projection(psi, self._residual(psi), np.zeros(0), lambda: self._jacobian(psi))
+        residual = self._residual(psi)
+
+        def normal() -> tuple[FloatArray, FloatArray]:
+            jacobian = self._jacobian(psi)
+            return jacobian.T @ residual, jacobian.T @ jacobian
+
+        return Projection(psi, residual, np.zeros(0), normal)
 
     def down(
         self, start: list[float], lower: FloatArray, upper: FloatArray, evaluations: int = 200

@@ -90,13 +90,12 @@ def test_the_best_of_several_starts_wins():
     assert both.dynamics.modes()[0].frequency == pytest.approx(90.0, rel=1e-4)
 
 
-def test_the_jacobian_after_elimination_points_downhill():
+def test_the_slope_after_elimination_points_downhill():
     structure = Structure(2, 1, True)
     problem = problem_of(resonance(60.0, 0.2), noise=1e-8)
     scaled = ScaledStructure(structure, RATE)
     shape = start(structure, [-1 + 1.5j, -1 - 1.5j])
-    at = problem.project(scaled, shape)
-    gradient = at.jacobian.T @ at.residual
+    gradient, _ = problem.project(scaled, shape).normal_equations
     assert len(gradient) == len(shape) > 0
     for k in range(len(shape)):
         step = np.zeros_like(shape)
@@ -106,6 +105,26 @@ def test_the_jacobian_after_elimination_points_downhill():
             for sign in (1, -1)
         ]
         assert gradient[k] == pytest.approx((costs[0] - costs[1]) / 2e-5, rel=1e-3, abs=0)
+
+
+@pytest.mark.parametrize("further", [False, True])
+def test_sums_over_lines_are_those_over_the_compared_samples(further):
+    """Step by step: what is not compared is filled in better each time a step starts."""
+    structure = Structure(2, 1, True)
+    problem = problem_of(resonance(60.0, 0.2), noise=1e-8)
+    lost = np.random.default_rng(2).random(len(problem.used)) < 0.05
+    axis = np.roll(problem.input, 700)[np.newaxis] if further else ()
+    problem = replace(problem, used=problem.used & ~lost, further=axis)
+    scaled = ScaledStructure(structure, RATE)
+    shape = start(structure, [-1 + 1.5j, -1 - 1.5j])
+    project, exact = problem.by_lines(scaled), problem.project(scaled, shape)
+    for _ in range(40):
+        at = project(shape)
+        slope, curvature = at.normal_equations
+    np.testing.assert_allclose(at.linear, exact.linear, rtol=1e-6, atol=1e-6)
+    assert at.residual @ at.residual == pytest.approx(exact.residual @ exact.residual, rel=1e-12)
+    np.testing.assert_allclose(slope, exact.normal_equations[0], rtol=1e-4)
+    np.testing.assert_allclose(curvature, exact.normal_equations[1], rtol=0.3)
 
 
 def test_sensitivity_is_the_derivative_of_the_output():
