@@ -119,7 +119,9 @@ class _Spectra:
         """Return an orthonormal basis (places, states + 1) of initial states and offset."""
         # Where even the slowest state has decayed to rounding, e^-36, all places are one row.
         downs = [recursion(d1 / RATE, d2 / RATE**2, self.hold, 1.0) for d1, d2 in sections]
-        slowest = max((np.max(np.abs(np.roots(down))) for down in downs), default=0.0)
+        first, last = np.array([(*down[1:], 0.0)[:2] for down in downs]).reshape(-1, 2).T
+        apart = np.sqrt(first**2 / 4 - last + 0j)
+        slowest = np.max(np.abs([apart - first / 2, apart + first / 2]), initial=0.0)
         lasting = min(int(-36 / np.log(np.clip(slowest, 1e-9, 1 - 1e-9))) + 2, len(self.record))
         early = self.places[self.places < lasting]
         late = len(self.places) - len(early)

@@ -10,7 +10,7 @@ from scipy import signal
 from sections_of_polynomials import from_polynomials
 from soaked import soaked
 
-from omsm_ros.core.estimation import sampled_choice, sampled_fit
+from omsm_ros.core.estimation import sampled_choice
 from omsm_ros.core.estimation.parallel_sections import HOLDS, ParallelSections
 from omsm_ros.core.estimation.sampled_choice import (
     EXPLORED_ON,
@@ -24,6 +24,7 @@ from omsm_ros.core.identification import sampled_identification
 from omsm_ros.core.identification.sampled_identification import identify_samples
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import ConfigurationError, IdentificationError
+from omsm_ros.linear_algebra import inverse_gram
 
 PERIOD = 0.05
 TRUTH = TransferFunction.from_ascending([2.0, 0.05], [1.0, 0.05, 0.02])
@@ -470,4 +471,4 @@ def test_a_delay_that_a_few_poles_imitate_is_not_taken():
 
 def test_a_column_that_rounding_leaves_less_than_nothing_is_ignored():
     gram = np.array([[4.0, 0.0], [0.0, -1e-30]])
-    np.testing.assert_allclose(sampled_fit._inverse(gram), [[0.25, 0.0], [0.0, 0.0]])
+    np.testing.assert_allclose(inverse_gram(gram), [[0.25, 0.0], [0.0, 0.0]])
