@@ -147,7 +147,9 @@ def parameter_covariance(
         length = fft.next_fast_len(part.stop - part.start + _MAX_NOISE_ORDER, real=True)
         noise = with_walk(noise_spectrum(own, length), walk, length)
         if passed is not None:
-            came = _motion_noise_spectrum(problem, passed, length)
+            frequency = fft.rfftfreq(length, problem.period)
+            moves = 2 * np.pi * frequency <= problem.rate * np.max(np.abs(problem.s))
+            came = moves * np.abs(problem.noise * passed.response(frequency)) ** 2
             noise = np.maximum(noise, np.mean(own**2) - np.mean(came) + came)
         score_covariance = score_covariance + weighted_gram(on_grid[:, part], length, noise)
     gram = columns.T @ columns
@@ -168,13 +170,6 @@ def gain_uncertainty_alone(problem: Problem, fitted: Fit) -> float:
     """Return the relative standard uncertainty of the gain with lag and curvature fitted too."""
     every = parameter_covariance(problem, problem.low_order_sensitivity(fitted), fitted.residual)
     return float(np.sqrt(every[0, 0]) / abs(fitted.gain))
-
-
-def _motion_noise_spectrum(problem: Problem, passed: TransferFunction, length: int) -> FloatArray:
-    frequency = fft.rfftfreq(length, problem.period)
-    moves = 2 * np.pi * frequency <= problem.rate * np.max(np.abs(problem.s))
-    power = np.abs(passed.response(frequency)) ** 2 * problem.noise**2
-    return np.asarray(np.where(moves, power, 0.0))
 
 
 def inter_sample_motion_covariance(

@@ -34,7 +34,10 @@ def impulse_response(inputs: FloatArray, output: FloatArray, used: BoolArray) ->
     gram, moment = gram_of(inputs, target, taps)
     power, least, best = float(target @ target), np.inf, np.zeros(len(moment))
     for decay in _DECAYS:
-        root = linalg.block_diag(*[_root_of_kernel(taps, decay)] * count)
+        # A root R of the kernel, K = R Rᵀ: sums of steps that decay.
+        kernel = np.exp(-decay * np.arange(taps + 1) / taps)
+        own = np.triu(np.ones((taps, taps))) * np.sqrt(kernel[:-1] - kernel[1:])
+        root = linalg.block_diag(*[own] * count)
         values, directions = np.linalg.eigh(root.T @ gram @ root)
         along, values = directions.T @ (root.T @ moment), np.maximum(values, 0.0)
         unit = float(values[-1])
@@ -45,12 +48,6 @@ def impulse_response(inputs: FloatArray, output: FloatArray, used: BoolArray) ->
             if score < least:
                 least, best = score, root @ (directions @ (along / (values + ratio)))
     return best.reshape(count, taps)
-
-
-def _root_of_kernel(taps: int, decay: float) -> FloatArray:
-    """Return a root R of the TC kernel, K = R Rᵀ: sums of steps that decay by e^-decay."""
-    kernel = np.exp(-decay * np.arange(taps + 1) / taps)
-    return np.asarray(np.triu(np.ones((taps, taps))) * np.sqrt(kernel[:-1] - kernel[1:]))
 
 
 def gram_of(inputs: FloatArray, target: FloatArray, taps: int) -> tuple[FloatArray, FloatArray]:

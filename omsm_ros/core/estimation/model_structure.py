@@ -59,7 +59,7 @@ class ScaledStructure:
         """Return L = e^{-τs} / denominator at scaled ``s`` (k,), (k,)."""
         denominator = np.ones_like(s)
         for section in self.sections(nonlinear):
-            denominator = denominator * _value(section, s)
+            denominator = denominator * polynomial.polyval(s, section)
         if not self.structure.delay:
             return np.asarray(1 / denominator)
         return np.asarray(np.exp(-self._delay(nonlinear) * s) / denominator)
@@ -68,7 +68,7 @@ class ScaledStructure:
         """Return d ln L / dψ (len ψ, k) at scaled ``s`` (k,), see :meth:`lag`."""
         first, second = [], []
         for section in self.sections(nonlinear):
-            value = _value(section, s)
+            value = polynomial.polyval(s, section)
             if len(section) == 3:
                 second.append(-section[2] * s * s / value)
             first.append(-section[1] * s / value)
@@ -118,9 +118,3 @@ class ScaledStructure:
         logs = np.log(np.concatenate([firsts, [second for _, second in sections]]))
         tail = [delay] if self.structure.delay else []
         return np.concatenate([np.clip(logs, -_LOG_RANGE, _LOG_RANGE), tail])
-
-
-def _value(section: FloatArray, s: ComplexArray) -> ComplexArray:
-    """Return 1 + d1 s + d2 s² (k,) of an ascending section; general code takes twice as long."""
-    rest = section[1] * s if len(section) == 2 else s * (section[1] + section[2] * s)
-    return np.asarray(1 + rest)

@@ -110,7 +110,12 @@ def timing_variance(on_grid: FloatArray, rate: FloatArray, *, noisy: bool = Fals
     known = np.isfinite(second)
     second, weight = second[known], weight[known]
     still = weight < _STILL * np.max(weight, initial=0.0)
-    if np.sum(still) < _LEAST_STILL or _persists(on_grid, rate):
+    # What persists from sample to sample in motion is no scatter in time.
+    moving = (square > _STILL * np.max(square)) & np.isfinite(on_grid)
+    product = np.where(moving, on_grid, 0.0)
+    product = product[1:] * product[:-1]
+    persists = np.sum(product) > _CLEARLY * float(np.linalg.norm(product))
+    if np.sum(still) < _LEAST_STILL or persists:
         return 0.0
     at_rest = float(np.mean(second[still] ** 2))
     if noisy:
@@ -122,14 +127,6 @@ def timing_variance(on_grid: FloatArray, rate: FloatArray, *, noisy: bool = Fals
     known_to = 1 / total + (float(np.sum(weight)) / total) ** 2 / float(np.sum(still))
     spread = at_rest * np.sqrt(2 * _SHARED * known_to)
     return found if found > _CLEARLY * spread else 0.0
-
-
-def _persists(on_grid: FloatArray, rate: FloatArray) -> bool:
-    moving = rate**2 > _STILL * np.max(rate**2)
-    value = np.where(moving & np.isfinite(on_grid), on_grid, 0.0)
-    product = value[1:] * value[:-1]
-    spread = float(np.sqrt(np.sum(product**2)))
-    return bool(np.sum(product) > _CLEARLY * spread)
 
 
 def motion_scatter(motion: FloatArray, rate: FloatArray) -> float:
@@ -278,7 +275,10 @@ def _followed(
     (alike,), (chance,) = _shares(odd, left, whole)
     alike = float(alike) if alike > _CLEARLY * chance else 0.0
     found, known_to = _shares(made, seen - alike * direct, band)
-    own = np.abs(found - _weighted_median(found, 1 / known_to)) > _CLEARLY * known_to
+    order = np.argsort(found)
+    total = np.cumsum(1 / known_to[order])
+    median = found[order][np.searchsorted(total, 0.5 * total[-1])]
+    own = np.abs(found - median) > _CLEARLY * known_to
     weight = np.where(own, 0.0, known_to**-2.0)
     share = np.where(own, found, np.sum(weight * found) / np.sum(weight))
     known_to = _CLEARLY * np.where(own, known_to, np.sum(weight) ** -0.5)
@@ -298,12 +298,6 @@ def _shares(
     rest = seen - share[band] * expected
     spread = np.sqrt(np.bincount(band, 0.5 * np.abs(rest * expected) ** 2)) / power
     return np.asarray(share, np.float64), np.asarray(np.maximum(spread, _TINY), np.float64)
-
-
-def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
 def smoothed(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -78,18 +77,13 @@ class EvaluationBudget:
 class Projection:
     """The residual (k,) at one ψ, ``nonlinear``, and the linear parameters (m + 1 + q,) there.
 
-    normal: computes half the slope of the sum of squares (len ψ,) and its curvature
+    normal: returns half the slope of the sum of squares (len ψ,) and its curvature
     """
 
     nonlinear: FloatArray
     residual: FloatArray
     linear: FloatArray
     normal: Callable[[], tuple[FloatArray, FloatArray]]
-
-    @cached_property
-    def normal_equations(self) -> tuple[FloatArray, FloatArray]:
-        """Return ``normal()``, computed when a step starts here."""
-        return self.normal()
 
 
 Project = Callable[[FloatArray], Projection]
@@ -109,10 +103,12 @@ def descend(project: Project, start: Projection, box: Box, evaluations: int) -> 
         return at
     lower, upper = box
     damping, growth = _FIRST_DAMPING, 2.0
-    cost = float(at.residual @ at.residual)
+    cost, moved = float(at.residual @ at.residual), True
     for _ in range(evaluations):
         nonlinear = at.nonlinear
-        slope, curvature = at.normal_equations
+        if moved:
+            slope, curvature = at.normal()
+            moved = False
         # A parameter at its bound whose step would leave the box is fixed.
         free = ~(((nonlinear <= lower) & (slope > 0)) | ((nonlinear >= upper) & (slope < 0)))
         scale = np.sqrt(np.maximum(np.diag(curvature), 0.0))
@@ -123,13 +119,13 @@ def descend(project: Project, start: Projection, box: Box, evaluations: int) -> 
         tried = project(np.clip(nonlinear + step, lower, upper))
         new_cost = float(tried.residual @ tried.residual)
         if not new_cost < cost:
-            moved = np.abs(tried.nonlinear - nonlinear)
-            if np.all(moved <= _SMALLEST_STEP * (1 + np.abs(nonlinear))):
+            way = np.abs(tried.nonlinear - nonlinear)
+            if np.all(way <= _SMALLEST_STEP * (1 + np.abs(nonlinear))):
                 break
             damping, growth = damping * growth, growth * 2
             continue
         gained, promised = cost - new_cost, -float(step @ (2 * slope + curvature @ step))
-        at, cost = tried, new_cost
+        at, cost, moved = tried, new_cost, True
         ratio = gained / promised if promised > 0 else 1.0
         damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
         if gained <= _CONVERGED * cost / len(at.residual) and damping < 1:

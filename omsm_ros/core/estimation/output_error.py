@@ -137,10 +137,6 @@ class Problem:
         """Transform of ``values`` (n,), closed to a period, at ``s``, shape (k,)."""
         return np.asarray(fft.rfft(close_period(values, self.period)))[: len(self.s)]
 
-    def padded_spectrum(self, values: FloatArray) -> ComplexArray:
-        """Transform of ``values`` (n,) followed by zeros, at ``s``, shape (k,)."""
-        return np.asarray(fft.rfft(values, self.closed_length))[: len(self.s)]
-
     @cached_property
     def _spectrum(self) -> ComplexArray:
         closed = np.asarray(fft.rfft(close_period(self.input, self.period)), np.complex128)
@@ -252,30 +248,22 @@ class Problem:
         """Roots of the weights (k,) of lines by which their products sum as those in time do."""
         weights = np.full(len(self.s), np.sqrt(2 / self.closed_length))
         weights[0] /= np.sqrt(2)
-        if 2 * len(self.s) == self.closed_length + 2:
-            weights[-1] /= np.sqrt(2)
+        # One line at half the sampling rate, which is real, is left out.
+        weights[self.closed_length // 2 :] = 0.0
         return weights
 
     def _lines(self, spectra: ComplexArray) -> FloatArray:
         """Return ``spectra`` (…, k), real and imaginary parts side by side, weighted (…, 2k)."""
-        found = (spectra * self._weights).view(np.float64)
-        if 2 * len(self.s) == self.closed_length + 2:
-            found[..., -1] = 0.0  # the line at half the sampling rate is real
-        return np.asarray(found)
+        return np.asarray((spectra * self._weights).view(np.float64))
 
     def _compared_lines(self, values: FloatArray) -> FloatArray:
         """Return ``values`` (k,) of the compared samples, 0 elsewhere, as :meth:`_lines`."""
-        return self._lines(self.padded_spectrum(self.on_grid(values, 0.0)))
+        padded = fft.rfft(self.on_grid(values, 0.0), self.closed_length)
+        return self._lines(np.asarray(padded)[: len(self.s)])
 
     @cached_property
     def _background_lines(self) -> FloatArray:
         return np.array([self._compared_lines(column) for column in self._fixed.T])
-
-    @property
-    def few_missing(self) -> bool:
-        """Return whether little of the period is not compared, and no response starts there."""
-        missing = 1 - len(self._target) / self.closed_length
-        return missing < _FEW_MISSING and not self.fits_initial_condition
 
     @cached_property
     def _filled(self) -> FloatArray:
@@ -283,7 +271,7 @@ class Problem:
         moved = self.motion[self._kept]
         gain = least_squares(np.column_stack([moved, self._fixed]), self._target)[0]
         left = self._compared_lines(self._target - gain * moved)
-        return left + gain * self._lines(self._spectrum)
+        return np.asarray(left + gain * self._lines(self._spectrum))
 
     def by_lines(self, scaled: ScaledStructure) -> Project:
         """Return a projection as :meth:`project` whose products are sums over lines of spectra.
@@ -483,7 +471,9 @@ def fit(
         return by_lines(nonlinear) if by_lines else problem.project(scaled, nonlinear)
 
     best, least = None, np.inf
-    by_lines = problem.by_lines(scaled) if problem.few_missing else None
+    compared = np.sum(problem.used) > (1 - _FEW_MISSING) * problem.closed_length
+    # A response to what was before the record is largest where nothing is compared.
+    by_lines = None if problem.fits_initial_condition or not compared else problem.by_lines(scaled)
     for start in starts:
         found = descend(project, project(np.clip(start, *box)), box, _RACE_EVALUATIONS)
         cost = float(np.sum(found.residual**2))
@@ -497,9 +487,6 @@ def fit(
 def evaluated(problem: Problem, structure: Structure, nonlinear: FloatArray) -> Fit:
     """Return ``structure`` at the given ψ; only the linear parameters are fitted."""
     scaled = ScaledStructure(structure, problem.rate)
-    return _fit_at(problem, scaled, problem.project(scaled, nonlinear))
-
-
-def _fit_at(problem: Problem, scaled: ScaledStructure, at: Projection) -> Fit:
+    at = problem.project(scaled, nonlinear)
     terms = len(at.linear) - problem.background.shape[1]
     return Fit(scaled, at.nonlinear, at.linear[:terms], at.linear[terms:], at.residual)

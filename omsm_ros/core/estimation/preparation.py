@@ -18,7 +18,7 @@ from scipy import ndimage, signal
 
 from omsm_ros.core.estimation.model_order import StartingPoints
 from omsm_ros.core.estimation.noise import plateau_variance, plateaus, reading_step
-from omsm_ros.core.estimation.output_error import STATIONARY_S, Fit, Problem, fit
+from omsm_ros.core.estimation.output_error import STATIONARY_S, Problem, fit
 from omsm_ros.core.estimation.steps import (
     LEAST_SAMPLES,
     NOISE_FACTOR,
@@ -78,26 +78,26 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
             # Noise of an encoder is no motion that the probe could follow.
             raise StepTestError("estimation.axis_at_rest", axis=axis)
     motion, axis_spikes = _bridged(_motion(record, source))
-    steps = _complete_edges(find_steps(motion, record.sample_period), record)
+    steps, lost = find_steps(motion, record.sample_period), record.z_lost
+    if lost is not None:
+        whole = tuple(e for e in steps.edges if not np.any(lost[e.start : e.stop]))
+        steps = replace(steps, edges=whole)
     problem = _problem(record, motion, steps)
     if steps.edges:
         # Without plateaus a lag of half a period inverts the gain; the fit shows it.
         check_gain(_static_gain(problem))
     _check_not_clipped(problem)
     problem, spikes = _without_spikes(problem)
-    return Prepared(_with_reading_steps(problem, steps), steps, spikes, axis_spikes)
-
-
-def _with_reading_steps(problem: Problem, steps: Steps) -> Problem:
     plateau, output = plateaus(steps, problem.used), problem.output[problem.used]
     step = reading_step(problem.input)
-    return replace(
+    problem = replace(
         problem,
         plateau=plateau,
         shared=plateau_variance(output, plateau[problem.used], reading_step(output)),
         input_error=step**2 / 12,
         input_shared=plateau_variance(problem.input, plateau, step),
     )
+    return Prepared(problem, steps, spikes, axis_spikes)
 
 
 def _motion(record: MotionRecord, source: str) -> FloatArray:
@@ -135,9 +135,12 @@ def _bridged(motion: FloatArray) -> tuple[FloatArray, int]:
 
 
 def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
-    samples = len(record)
-    used = record.ok & ~_affected_by_loss(record)
-    used[: min(round(_SETTLING_S / record.sample_period), samples // 10)] = False
+    samples, settling = len(record), round(_SETTLING_S / record.sample_period)
+    used = record.ok.copy()
+    if record.z_lost is not None:  # the response depends on lost positions
+        ahead = np.pad(record.z_lost, (0, _EDGE_GUARD))
+        used &= ~extended(ahead, settling + _EDGE_GUARD)[_EDGE_GUARD:]
+    used[: min(settling, samples // 10)] = False
     used[samples - min(_EDGE_GUARD, samples // 10) :] = False
     carried = faded_to_stationary(motion, steps.moving, record.sample_period)
     used &= carried == motion
@@ -247,24 +250,6 @@ def faded_to_stationary(motion: FloatArray, moving: BoolArray, period: float) ->
     return carried
 
 
-def _affected_by_loss(record: MotionRecord) -> BoolArray:
-    """Return True where the response depends on lost positions, shape (n,)."""
-    samples = len(record)
-    if record.z_lost is None:
-        return np.zeros(samples, np.bool_)
-    ahead = np.concatenate([record.z_lost, np.zeros(_EDGE_GUARD, np.bool_)])
-    memory = round(_SETTLING_S / record.sample_period) + _EDGE_GUARD
-    return extended(ahead, memory)[_EDGE_GUARD:]
-
-
-def _complete_edges(steps: Steps, record: MotionRecord) -> Steps:
-    if record.z_lost is None:
-        return steps
-    lost = record.z_lost
-    whole = tuple(e for e in steps.edges if not np.any(lost[e.start : e.stop]))
-    return replace(steps, edges=whole)
-
-
 def input_bandwidth(motion: FloatArray, sample_period: float) -> float:
     """Return the frequency [Hz] below which 99 % of the energy of the velocity lies, with noise."""
     power = np.abs(np.fft.rfft(np.diff(motion))) ** 2
@@ -343,31 +328,20 @@ def check_axis_steps(prepared: Prepared) -> None:
     problem = prepared.problem
     positions = problem.input[problem.used]
     step, noise = reading_step(positions), sample_noise(problem.output[problem.used])
-    if step**2 / 12 <= noise**2 or not _moves_unevenly(positions, step):
+    advance = np.diff(positions)
+    moves = (np.abs(advance[:-1]) > step / 2) | (np.abs(advance[1:]) > step / 2)
+    uneven = moves & (np.abs(np.diff(advance)) > step / 2)
+    if step**2 / 12 <= noise**2 or np.sum(uneven) <= _UNEVEN * np.sum(moves):
         return
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
     plain = fit(problem, _PLAIN, StartingPoints(problem, lag).of(_PLAIN, [lag]))
     moving = prepared.steps.moving[problem.used]
     left = float(np.mean(plain.residual[moving] ** 2)) - noise**2 if np.any(moving) else 0.0
-    low, high = (
-        part * _rounding_error_variance(plain, step, problem.period) for part in _AS_ROUNDING
-    )
+    lines = np.linspace(0, 0.5 / problem.period, _FREQUENCIES)
+    passed = float(np.mean(np.abs(plain.gain * plain.dynamics.response(lines)) ** 2))
+    low, high = (part * passed * step**2 / 12 for part in _AS_ROUNDING)
     if left > _SEEN * noise**2 and low < left < high:
         residual = float(np.sqrt(left))
         raise IdentificationError(
             "estimation.coarse_positions", step=step, residual=residual, noise=noise
         )
-
-
-def _moves_unevenly(positions: FloatArray, step: float) -> bool:
-    advance = np.diff(positions)
-    moves = (np.abs(advance[:-1]) > step / 2) | (np.abs(advance[1:]) > step / 2)
-    changes = np.abs(np.diff(advance)) > step / 2
-    return bool(np.sum(changes & moves) > _UNEVEN * np.sum(moves))
-
-
-def _rounding_error_variance(fitted: Fit, step: float, period: float) -> float:
-    """Return the variance [m²] of evenly spread errors of ``step`` [m] through ``fitted``."""
-    lines = np.linspace(0, 0.5 / period, _FREQUENCIES)
-    passed = float(np.mean(np.abs(fitted.dynamics.response(lines)) ** 2))
-    return fitted.gain**2 * passed * step**2 / 12

@@ -164,7 +164,12 @@ def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsPr
     """
     every = min(_decimation(record) for record in whole.records)
     while every:
-        records = _exciting_parts([_thinned(record, every) for record in whole.records])
+        thinned = []
+        for record in whole.records:
+            values = np.column_stack([record.inputs, record.filled()])
+            fewer = np.asarray(signal.resample_poly(values, 1, every, axis=0, padtype="line"))
+            thinned.append(SampledRecord(fewer[:, :-1], fewer[:, -1], record.used[::every]))
+        records = _exciting_parts(thinned)
         try:
             most = min(most, check_records(records, order))
         except IdentificationError:
@@ -174,15 +179,6 @@ def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsPr
             return SectionsProblem(records, *held), every, most
     # No part excites as much as the whole record.
     return whole, 1, most
-
-
-def _thinned(record: SampledRecord, every: int) -> SampledRecord:
-    """Return one in ``every`` samples, behind a low pass."""
-    inputs, output = (
-        np.asarray(signal.resample_poly(values, 1, every, axis=0, padtype="line"))
-        for values in (record.inputs, record.filled())
-    )
-    return SampledRecord(inputs, output, record.used[::every])
 
 
 def check_records(records: Sequence[SampledRecord], order: int) -> int:

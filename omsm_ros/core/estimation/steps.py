@@ -72,13 +72,10 @@ def sample_noise(values: FloatArray) -> float:
         rests = windows[: len(moved)][moved <= 1.5 * step]
         return float(np.sqrt(np.median(np.mean(rests**2, axis=1)) / 6)) if len(rests) else 0.0
     orders = [order for order in _DIFFERENCES if order < len(values)]
-    return min((_difference_noise(values, order) for order in orders), default=0.0)
-
-
-def _difference_noise(values: FloatArray, order: int) -> float:
     # MAD of a normal distribution is 0.6745 σ; k-th differences have variance C(2k, k) σ².
-    middle = float(np.median(np.abs(np.diff(values, order))))
-    return middle / 0.6745 / float(np.sqrt(special.comb(2 * order, order)))
+    middles = [float(np.median(np.abs(np.diff(values, order)))) for order in orders]
+    units = [0.6745 * float(np.sqrt(special.comb(2 * order, order))) for order in orders]
+    return min((m / u for m, u in zip(middles, units, strict=True)), default=0.0)
 
 
 def find_steps(z: FloatArray, sample_period: float) -> Steps:

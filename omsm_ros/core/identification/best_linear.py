@@ -137,15 +137,11 @@ def _periods(record: MotionRecord, plan: MultisinePlan) -> tuple[FloatArray, Flo
         values[start : start + np.prod(shape)].reshape(shape)[:, 1:]
         for values in (record.z, distance)
     )
-    return np.asarray(motion), _without_drift(output)
-
-
-def _without_drift(output: FloatArray) -> FloatArray:
-    """Return ``output`` less the linear drift of each realisation, from its periods."""
+    # Less the linear drift of each realisation, from its periods.
     periods, samples = output.shape[1:]
     slope = np.mean(output[:, -1] - output[:, 0], axis=1) / (samples * max(periods - 1, 1))
     time = np.arange(periods * samples).reshape(periods, samples)
-    return np.asarray(output - slope[:, np.newaxis, np.newaxis] * time)
+    return np.asarray(motion), np.asarray(output - slope[:, np.newaxis, np.newaxis] * time)
 
 
 def multisine_findings(

@@ -25,12 +25,11 @@ from omsm_ros.core.estimation.output_error import Fit
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.estimation.steps import LEAST_SAMPLES, Steps
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.core.model_errors.families import CREEP, MODE, ModelErrorTerm
+from omsm_ros.core.model_errors.families import CREEP
 from omsm_ros.core.model_errors.residual_diagnostics import Contrast, ResidualDiagnostics
 from omsm_ros.core.model_errors.undetected import (
     UNDETECTED,
     UndetectedTerm,
-    alternative_mode_covariance,
     undetected_terms,
     with_slow_creep,
 )
@@ -130,16 +129,6 @@ COVARIANCE_TERMS: tuple[Callable[[Prepared, Fit], FloatArray], ...] = (inter_sam
 """Terms that add to the covariance (p, p) of every fit."""
 
 
-def delay_covariance(lag: ReferenceLag, size: int) -> FloatArray:
-    """Return the covariance (``size``, ``size``) of a delay that is off by ``lag``.
-
-    A correction filters the encoder, so the lag of the reference would be missing from it.
-    """
-    covariance = np.zeros((size, size))
-    covariance[-1, -1] = lag.value**2 + lag.uncertainty**2
-    return covariance
-
-
 def contrast_covariance(found: Sequence[Contrast], dynamics: TransferFunction) -> FloatArray:
     """Return the covariance (p, p) of parts of a test that differ; zero where none do.
 
@@ -183,20 +172,6 @@ def undetected_covariance(
         lowest_mode_hz=1 / diagnostics.plateau,
     )
     return [term.covariance(_carried(term, priors)) for term in terms], found
-
-
-def alternative_modes(
-    without: Sequence[ResidualDiagnostics], terms: Sequence[ModelErrorTerm], fitted: Fit
-) -> list[FloatArray]:
-    """Return covariances (p, p) of the alternatives of each lightly damped mode in ``terms``.
-
-    without: diagnostics of the fit before each of ``terms`` became a part of ``fitted``
-    """
-    return [
-        alternative_mode_covariance(before, term, fitted)
-        for before, term in zip(without, terms, strict=True)
-        if term.family == MODE
-    ]
 
 
 def _priors(settings: Mapping[str, object]) -> dict[str, float]:

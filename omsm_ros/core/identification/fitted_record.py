@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.estimation.steps import Edge
 from omsm_ros.core.identification.identify import Identification
 from omsm_ros.core.lti.frequency_response import FrequencyResponse, frequency_response
@@ -50,6 +49,10 @@ def fitted_record(identified: Identification) -> FittedRecord:
     problem, fit = identified.prepared.problem, identified.fit
     modelled = problem.response(fit)
     residual = problem.on_grid(fit.residual, np.nan)
+    segment, measured = round(_SEGMENT_S / problem.period), None
+    if _LEAST_SEGMENT <= segment <= len(residual) // 2:
+        output = modelled + np.nan_to_num(residual / fit.gain)
+        measured = frequency_response(problem.input, output, problem.period, segment)
     return FittedRecord(
         sample_period=problem.period,
         input=problem.input,
@@ -57,18 +60,8 @@ def fitted_record(identified: Identification) -> FittedRecord:
         modelled=modelled,
         residual=residual,
         edges=identified.prepared.steps.edges,
-        measured=_measured(problem, modelled, residual / fit.gain),
+        measured=measured,
     )
-
-
-def _measured(
-    problem: Problem, modelled: FloatArray, missed: FloatArray
-) -> FrequencyResponse | None:
-    segment = round(_SEGMENT_S / problem.period)
-    if not _LEAST_SEGMENT <= segment <= len(missed) // 2:
-        return None
-    output = modelled + np.where(np.isfinite(missed), missed, 0.0)
-    return frequency_response(problem.input, output, problem.period, segment)
 
 
 def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:

@@ -47,9 +47,7 @@ from omsm_ros.core.estimation.preparation import Prepared, check_axis_steps, che
 from omsm_ros.core.estimation.steps import Edge, find_steps
 from omsm_ros.core.identification.checks import CHECKS, limits_of
 from omsm_ros.core.identification.covariance_terms import (
-    alternative_modes,
     contrast_covariance,
-    delay_covariance,
     inter_sample_delay_bound,
     reference_lag,
     undetected_covariance,
@@ -73,8 +71,9 @@ from omsm_ros.core.lti.modes import (
     response_features,
 )
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.core.model_errors.families import DRIFT
+from omsm_ros.core.model_errors.families import DRIFT, MODE
 from omsm_ros.core.model_errors.residual_diagnostics import Contrast, contrasts
+from omsm_ros.core.model_errors.undetected import alternative_mode_covariance
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, IdentificationError, StepTestError
@@ -214,12 +213,17 @@ def _evidence(
     ]
     best, diagnostics = model.chosen.fit, searched.diagnostics
     further, undetected = undetected_covariance(diagnostics, settings, drift, use)
-    further += alternative_modes(searched.without, searched.added_poles, best)
+    further += [
+        alternative_mode_covariance(before, term, best)
+        for before, term in zip(searched.without, searched.added_poles, strict=True)
+        if term.family == MODE
+    ]
     compared = contrasts(diagnostics)
     further.append(contrast_covariance(compared, best.dynamics))
     reference = reference_lag(record) if input == "reference" else None
     if reference is not None:
-        further.append(delay_covariance(reference, len(further[-1])))
+        # A correction filters the encoder, so the lag of the reference would be missing from it.
+        further[-1][-1, -1] += reference.value**2 + reference.uncertainty**2
     known = response_uncertainty(prepared, model, limits, further)
     if model.free is not None:
         known = inflate_to_free_choice(known, prepared, model, model.free, limits)
@@ -240,9 +244,9 @@ def table_mass(settings: Mapping[str, object]) -> float | None:
 
 
 def _chosen(
-    prepared: Prepared, budget: EvaluationBudget, *, order: int
+    prepared: Prepared, budget: EvaluationBudget, before: ChosenModel | None = None, *, order: int
 ) -> tuple[Prepared, ChosenModel]:
-    prepared, model = model_from_start(prepared, budget, order)
+    prepared, model = model_from_start(prepared, budget, before, order=order)
     check_gain(model.chosen.fit.gain, slack=_GAIN_SLACK)
     return prepared, model
 

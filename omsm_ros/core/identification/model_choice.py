@@ -19,10 +19,9 @@ from omsm_ros.core.estimation.model_order import (
     choose,
     explore,
     identifiable,
-    information,
 )
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
-from omsm_ros.core.estimation.output_error import STATIONARY_S, Fit, Problem, evaluated, fit
+from omsm_ros.core.estimation.output_error import STATIONARY_S, Fit, Problem, fit
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.estimation.steps import extended
 from omsm_ros.core.identification.residual_tests import noise_colour
@@ -69,13 +68,6 @@ def has_initial_response(
     return bool(explained * fitted.samples > colour * _CLEARLY_SHOWN * max(size, 1) * rest)
 
 
-# Difference of the criterion beyond which a structure is not chosen whatever the change. The chosen
-# structure is within one parameter of the best, at most 14.
-_MAY_BE_CHOSEN_BIC = 30.0
-# "Not worth more than a bare mention" (Kass and Raftery 1995).
-_ALIKE_BIC = 2.0
-
-
 @dataclass(frozen=True, eq=False)
 class ChosenModel:
     """The chosen candidate and those that were tried.
@@ -89,26 +81,44 @@ class ChosenModel:
 
 
 def choose_model(
-    prepared: Prepared, budget: EvaluationBudget | None = None, order: int = 0
+    prepared: Prepared,
+    budget: EvaluationBudget | None = None,
+    order: int = 0,
+    before: ChosenModel | None = None,
 ) -> ChosenModel:
     """Fit structures to the prepared problem and choose one.
 
     budget: of the evaluations; None for a budget of its own
     order: number of poles, 0 to choose it. The free choice is made in any case.
+    before: chosen for nearly the same problem; structures start where they ended there
     """
     problem, budget = prepared.problem, budget or EvaluationBudget()
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget)
+    known = {c.fit.structure: c.fit for c in before.candidates} if before else {}
     part, found = _excerpt(prepared), list[Fit]()
     points = StartingPoints(part or problem, lag if part is None else _refitted(part, lag, budget))
 
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
+        if structure in known:
+            return _refitted(problem, known[structure], budget)
         if part is None:
             return fit(problem, structure, points.of(structure, smaller), budget=budget)
         found.append(fit(part, structure, points.of(structure, found), budget=budget))
         return _refitted(problem, found[-1], budget)
 
     colour = noise_colour(problem, lag, prepared.steps)
-    return _model(problem, explore(fit_structure, order, colour, budget), order)
+    explored = explore(fit_structure, order, colour, budget)
+    duration = len(problem.input) * problem.period
+    candidates = [
+        c
+        for c in explored
+        if identifiable(c.fit.dynamics, problem.period, duration) and not _relaxes(c.fit.dynamics)
+    ]
+    free = ChosenModel(choose(candidates), candidates)
+    if not order:
+        return free
+    asked = [c for c in explored if c.fit.structure.poles == order]
+    return ChosenModel(choose(asked), asked, free)
 
 
 def _refitted(problem: Problem, known: Fit, budget: EvaluationBudget) -> Fit:
@@ -141,50 +151,6 @@ def _excerpt(prepared: Prepared) -> Problem | None:
     )
 
 
-def rechosen(problem: Problem, before: ChosenModel, budget: EvaluationBudget) -> ChosenModel | None:
-    """Return ``before``, chosen for an earlier problem, fitted to ``problem``.
-
-    Return None where the change improves some candidates more than others, because an untried
-    structure may then be better, and where an order was asked for.
-    """
-    if before.free is not None:
-        return None
-    best = min(c.bic for c in before.candidates)
-    changes, candidates = [], []
-    for known in before.candidates:
-        now = evaluated(problem, known.fit.structure, known.fit.nonlinear)
-        change = information(now) - information(known.fit)
-        if known.bic < best + _MAY_BE_CHOSEN_BIC:
-            changes.append(change)
-        candidates.append(Candidate(now, known.bic + change))
-    overtaken = min(c.bic for c in candidates) < best + min(changes)
-    if overtaken or max(changes) - min(changes) > _ALIKE_BIC:
-        return None
-    fitted, nonlinear = before.chosen.fit, before.chosen.fit.nonlinear
-    again = fit(problem, fitted.structure, [nonlinear], budget=budget)
-    chosen = Candidate(again, before.chosen.bic + information(again) - information(fitted))
-    others = [c for c in candidates if c.fit.structure != fitted.structure]
-    return replace(before, chosen=chosen, candidates=[*others, chosen])
-
-
-def _model(problem: Problem, explored: Sequence[Candidate], order: int) -> ChosenModel:
-    candidates = _identifiable(problem, explored)
-    free = ChosenModel(choose(candidates), candidates)
-    if not order:
-        return free
-    asked = [c for c in explored if c.fit.structure.poles == order]
-    return ChosenModel(choose(asked), asked, free)
-
-
-def _identifiable(problem: Problem, candidates: Sequence[Candidate]) -> Sequence[Candidate]:
-    duration = len(problem.input) * problem.period
-    return [
-        c
-        for c in candidates
-        if identifiable(c.fit.dynamics, problem.period, duration) and not _relaxes(c.fit.dynamics)
-    ]
-
-
 def _relaxes(dynamics: TransferFunction) -> bool:
     """Return True if a zero nearly cancels a slow pole that does not ring.
 
@@ -197,14 +163,18 @@ def _relaxes(dynamics: TransferFunction) -> bool:
 
 
 def model_from_start(
-    prepared: Prepared, budget: EvaluationBudget | None = None, order: int = 0
+    prepared: Prepared,
+    budget: EvaluationBudget | None = None,
+    before: ChosenModel | None = None,
+    *,
+    order: int = 0,
 ) -> tuple[Prepared, ChosenModel]:
     """Choose a model, with the initial-condition response where the record starts during one.
 
-    Returns the problem as it was fitted, and the model.
+    Returns the problem as it was fitted, and the model; ``before``: see :func:`choose_model`.
     """
     budget = budget or EvaluationBudget()
-    model = choose_model(prepared, budget, order)
+    model = choose_model(prepared, budget, order, before)
     colour = noise_colour(prepared.problem, model.chosen.fit, prepared.steps)
     at_rest = not prepared.steps.moving[0]
     if not has_initial_response(prepared.problem, model.chosen.fit, colour, at_rest=at_rest):

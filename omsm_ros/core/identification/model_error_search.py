@@ -16,7 +16,7 @@ from omsm_ros.core.estimation.noise import correct_errors_in_variables
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Fit, evaluated, fit
 from omsm_ros.core.estimation.preparation import Prepared
-from omsm_ros.core.identification.model_choice import ChosenModel, rechosen
+from omsm_ros.core.identification.model_choice import ChosenModel
 from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.model_errors.families import (
     BACKLASH,
@@ -79,7 +79,7 @@ class SearchResult:
     incomplete: bool = False
 
 
-Choose = Callable[[Prepared, EvaluationBudget], tuple[Prepared, ChosenModel]]
+Choose = Callable[..., tuple[Prepared, ChosenModel]]
 
 
 def search_model_errors(
@@ -91,7 +91,8 @@ def search_model_errors(
 ) -> SearchResult:
     """Add model errors to the problem or to the model until the residual shows no more.
 
-    choose: fits a prepared problem anew;  budget: of all evaluations, None for the default
+    choose: fits a prepared problem anew, as ``model_from_start``
+    budget: of all evaluations, None for the default
     may_grow: poles may be added to the model
     """
     search = _Search(choose, *_initial_model(prepared, choose, budget or EvaluationBudget()))
@@ -201,9 +202,7 @@ def _with_errors_in_variables(
         if problem is None:
             break
         quieter, own = replace(prepared, problem=problem), budget.renewed()
-        found = rechosen(problem, best[1], own)
-        if found is None:
-            quieter, found = choose(quieter, own)
+        quieter, found = choose(quieter, own, best[1])
         if information(found.chosen.fit) >= information(before):
             break
         best = quieter, found, own
@@ -218,38 +217,38 @@ def _drift(prepared: Prepared, budget: EvaluationBudget) -> list[ScoreTest]:
     problem = prepared.problem
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget)
     diagnostics = ResidualDiagnostics(problem, lag, prepared.steps, (CREEP, DRIFT, LINEARITY))
+    found = list[ScoreTest]()
     # If the decimated record shows none, all samples need not be tested.
-    if diagnostics.thinned is not None and not _detected_drift(diagnostics.thinned):
-        return []
-    return _detected_drift(diagnostics)
-
-
-def _detected_drift(diagnostics: ResidualDiagnostics) -> list[ScoreTest]:
-    shown = _select_nuisance_terms(diagnostics, diagnostics.significant())
-    return [judged for judged in shown if judged.term.family == DRIFT]
+    for each in filter(None, (diagnostics.thinned, diagnostics)):
+        shown = _select_nuisance_terms(each, each.significant())
+        found = [judged for judged in shown if judged.term.family == DRIFT]
+        if not found:
+            break
+    return found
 
 
 def _modelled_as_poles(
     prepared: Prepared, model: ChosenModel, budget: EvaluationBudget
 ) -> list[ScoreTest]:
     """Return nuisance terms that ``model`` fits by poles: with them a simple model is better."""
-    chosen = model.chosen
     plain = [c for c in model.candidates if c.fit.structure.poles <= _PLAIN_POLES]
-    if chosen.fit.structure.poles <= _PLAIN_POLES or not plain:
+    if model.chosen.fit.structure.poles <= _PLAIN_POLES or not plain:
         return []
     best = min(plain, key=lambda candidate: candidate.bic).fit
+    # Compared with the best of all: the chosen one has a parameter more than that.
+    rival = min((c.fit for c in model.candidates), key=information)
     diagnostics = ResidualDiagnostics(prepared.problem, best, prepared.steps, _NUISANCE_FAMILIES)
     fewer = diagnostics.thinned
     # If the decimated record shows none, all samples need not be tested.
     if fewer is not None:
-        there = evaluated(fewer.problem, chosen.fit.structure, chosen.fit.nonlinear)
+        there = evaluated(fewer.problem, rival.structure, rival.nonlinear)
         if not _improving_terms(prepared, fewer, there, budget):
             return []
-    return _improving_terms(prepared, diagnostics, chosen.fit, budget)
+    return _improving_terms(prepared, diagnostics, rival, budget)
 
 
 def _improving_terms(
-    prepared: Prepared, diagnostics: ResidualDiagnostics, chosen: Fit, budget: EvaluationBudget
+    prepared: Prepared, diagnostics: ResidualDiagnostics, rival: Fit, budget: EvaluationBudget
 ) -> list[ScoreTest]:
     columns = _select_nuisance_terms(diagnostics, diagnostics.significant())
     if not columns:
@@ -259,7 +258,7 @@ def _improving_terms(
     nuisance_terms = fit(problem, plain.structure, [plain.nonlinear], budget=budget)
     further = problem.background.shape[1] - diagnostics.problem.background.shape[1]
     better = information(nuisance_terms) + further * np.log(nuisance_terms.samples) < information(
-        chosen
+        rival
     )
     return columns if better else []
 

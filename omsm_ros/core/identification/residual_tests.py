@@ -8,7 +8,7 @@ covariance allows for coloured noise, but nothing allows for a missing mode.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft, stats
+from scipy import stats
 
 from omsm_ros.core.estimation.covariance import autoregression
 from omsm_ros.core.estimation.impulse_response import gram_of
@@ -133,7 +133,8 @@ def _noise(on_grid: FloatArray, used: BoolArray, rest: BoolArray) -> float:
 def whiteness(residual: FloatArray, lags: int = _LAGS) -> float:
     """Return the p-value of Ljung and Box's portmanteau test that ``residual`` (k,) is white."""
     n = len(residual)
-    correlation = _correlation(residual, residual, lags)[1:]
+    products = [residual[lag:] @ residual[: n - lag] for lag in range(lags + 1)]
+    correlation = np.array(products[1:]) / (products[0] or 1.0)
     statistic = n * (n + 2) * np.sum(correlation**2 / (n - np.arange(1, lags + 1)))
     return float(stats.chi2.sf(statistic, lags))
 
@@ -151,13 +152,6 @@ def independence(residual: FloatArray, drive: FloatArray, lags: int = _LAGS) -> 
     statistic = float(np.sum((directions.T @ moment)[kept] ** 2 / values[kept]))
     statistic /= float(np.mean(rest**2)) or 1.0
     return float(stats.chi2.sf(statistic, np.sum(kept))) if np.any(kept) else 1.0
-
-
-def _correlation(a: FloatArray, b: FloatArray, lags: int) -> FloatArray:
-    size = fft.next_fast_len(len(a) + lags + 1, real=True)
-    cross = fft.irfft(fft.rfft(a, size) * np.conj(fft.rfft(b, size)), size)[: lags + 1]
-    norm = float(np.linalg.norm(a) * np.linalg.norm(b)) or 1.0
-    return np.asarray(cross / norm)
 
 
 def response_agreement(residual: FrequencyResponse, up_to: float) -> float:

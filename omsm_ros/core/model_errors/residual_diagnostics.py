@@ -153,7 +153,9 @@ class ResidualSpace:
             return Score(size, covariance, 0.0, 0)
         rows, unit = rows[free] if not np.all(free) else rows, unit[free]
         rows /= unit[:, np.newaxis]
-        inverse, degrees = _pseudo_inverse(rows @ rows.T, _COLLINEAR_SHARE**2)
+        values, directions = np.linalg.eigh(rows @ rows.T)
+        kept = values > _COLLINEAR_SHARE**2 * values[-1]
+        inverse = directions[:, kept] / values[kept] @ directions[:, kept].T
         found = inverse @ (rows @ self._residual)
         walk = explained = 0.0
         # Drift is what walks.
@@ -165,7 +167,7 @@ class ResidualSpace:
         covariance[np.ix_(free, free)] = spread / np.outer(unit, unit)
         # Rounding that is common to a plateau would count as a walk, which the rows explain.
         explained *= self.problem.shared == 0
-        return Score(size, covariance, max(chi_square, explained), degrees)
+        return Score(size, covariance, max(chi_square, explained), int(np.sum(kept)))
 
     @cached_property
     def _residual(self) -> FloatArray:
@@ -206,13 +208,6 @@ class ResidualSpace:
 def _lengths(rows: FloatArray) -> FloatArray:
     """Return the lengths (c,) of ``rows`` (c, n), in less memory than numpy's norm."""
     return np.asarray(np.sqrt(np.einsum("cn,cn->c", rows, rows)))
-
-
-def _pseudo_inverse(gram: FloatArray, tolerance: float) -> tuple[FloatArray, int]:
-    values, directions = np.linalg.eigh(gram)
-    kept = values > tolerance * values[-1]
-    strong = directions[:, kept]
-    return np.asarray(strong / values[kept] @ strong.T), int(np.sum(kept))
 
 
 def smoothed_noise_spectrum(
@@ -366,17 +361,16 @@ class ResidualDiagnostics:
         rate = np.concatenate([np.zeros(_LAGS - 1), np.gradient(self.problem.motion)])
         # The last values of the rate, the newest last, 0 before the record.
         past = np.lib.stride_tricks.sliding_window_view(rate, _LAGS)
-        gram = np.zeros((_LAGS, _LAGS))
-        for first in range(0, len(past), BLOCK_ROWS):
-            rows = np.ascontiguousarray(past[first : first + BLOCK_ROWS])
-            gram += rows.T @ rows
+        parts = range(0, len(past), BLOCK_ROWS)
+        rows = (np.ascontiguousarray(past[i : i + BLOCK_ROWS]) for i in parts)
+        gram = np.sum([part.T @ part for part in rows], axis=0)
         powers, directions = np.linalg.eigh(gram)
         kept = powers > _ABOVE_ROUNDING**2 * powers[-1]
         if not np.any(kept):
             return 1.0
         mixed = directions[:, kept] / np.sqrt(powers[kept])
         columns = np.empty((mixed.shape[1], len(past)))
-        for first in range(0, len(past), BLOCK_ROWS):
+        for first in parts:
             columns[:, first : first + BLOCK_ROWS] = (past[first : first + BLOCK_ROWS] @ mixed).T
         return float(np.exp(self.space.judged(columns).log_p))
 

@@ -112,8 +112,13 @@ def undetected_terms(
     relaxations = [_undetected_terms(slow, judged, use) for judged in slow.creep]
     steady = [_STEADY_DRIFT]
     for gone in [steady, drift, [*steady, *drift]] if drift else [steady]:
-        other = with_drift_as_noise(slow, gone).creep
-        relaxations = [_better_relaxation(*pair) for pair in zip(relaxations, other, strict=True)]
+        # The size that the test would miss stays that of the fit, whose drift is free.
+        for i, (term, other) in enumerate(
+            zip(relaxations, with_drift_as_noise(slow, gone).creep, strict=True)
+        ):
+            size, uncertainty = float(other.score.size[0]), other.score.uncertainty
+            if np.hypot(size, uncertainty) < term.carried:
+                relaxations[i] = replace(term, size=size, uncertainty=uncertainty)
     known = [term for term in relaxations if np.isfinite(term.uncertainty)]
     found = (
         _worst_relaxation(known, fitted_relaxation(diagnostics.fitted.dynamics), use)
@@ -158,14 +163,6 @@ def with_drift_as_noise(
         diagnostics.steps,
         slower=diagnostics.slower,
     )
-
-
-def _better_relaxation(term: UndetectedTerm, other: ScoreTest) -> UndetectedTerm:
-    size, uncertainty = float(other.score.size[0]), other.score.uncertainty
-    if not np.hypot(size, uncertainty) < term.carried:
-        return term
-    # The size that the test would miss stays that of the fit, whose drift is free.
-    return replace(term, size=size, uncertainty=uncertainty)
 
 
 def _worst_relaxation(

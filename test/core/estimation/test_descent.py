@@ -224,7 +224,7 @@ def test_a_jacobian_is_made_once_and_only_where_a_step_starts() -> None:
 
 def test_half_the_slope_and_the_curvature_are_those_of_the_sum_of_squares() -> None:
     problem, psi = decay(), np.array([0.1, 0.9])
-    slope, curvature = problem(psi).normal_equations
+    slope, curvature = problem(psi).normal()
     step = 1e-5
     by_steps = [
         (cost(problem(psi + step * axis)) - cost(problem(psi - step * axis))) / (2 * step)
@@ -233,7 +233,7 @@ def test_half_the_slope_and_the_curvature_are_those_of_the_sum_of_squares() -> N
     assert 2 * slope == pytest.approx(by_steps, rel=1e-6)
     # Gauss-Newton: without the second derivatives of the residual, which vanish at the truth.
     truth = np.log([0.5, 4.0])
-    _, curvature = problem(truth).normal_equations
+    _, curvature = problem(truth).normal()
     bend = [
         (cost(problem(truth + 1e-3 * a)) + cost(problem(truth - 1e-3 * a))) / 1e-6
         for a in np.eye(2)

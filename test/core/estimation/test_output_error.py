@@ -95,7 +95,7 @@ def test_the_slope_after_elimination_points_downhill():
     problem = problem_of(resonance(60.0, 0.2), noise=1e-8)
     scaled = ScaledStructure(structure, RATE)
     shape = start(structure, [-1 + 1.5j, -1 - 1.5j])
-    gradient, _ = problem.project(scaled, shape).normal_equations
+    gradient, _ = problem.project(scaled, shape).normal()
     assert len(gradient) == len(shape) > 0
     for k in range(len(shape)):
         step = np.zeros_like(shape)
@@ -120,11 +120,11 @@ def test_sums_over_lines_are_those_over_the_compared_samples(further):
     project, exact = problem.by_lines(scaled), problem.project(scaled, shape)
     for _ in range(40):
         at = project(shape)
-        slope, curvature = at.normal_equations
+        slope, curvature = at.normal()
     np.testing.assert_allclose(at.linear, exact.linear, rtol=1e-6, atol=1e-6)
     assert at.residual @ at.residual == pytest.approx(exact.residual @ exact.residual, rel=1e-12)
-    np.testing.assert_allclose(slope, exact.normal_equations[0], rtol=1e-4)
-    np.testing.assert_allclose(curvature, exact.normal_equations[1], rtol=0.3)
+    np.testing.assert_allclose(slope, exact.normal()[0], rtol=1e-4)
+    np.testing.assert_allclose(curvature, exact.normal()[1], rtol=0.3)
 
 
 def test_sensitivity_is_the_derivative_of_the_output():
