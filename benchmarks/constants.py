@@ -59,8 +59,6 @@ _PLACES = {
     "_LAGS": f"{_ROOT}.residual_diagnostics",
     "_LEAST_LIKELY": f"{_ROOT}.undetected",
     "_LITTLE": f"{_ROOT}.undetected",
-    "_ALIKE_BIC": f"{_IDENTIFICATION}.model_choice",
-    "_MAY_BE_CHOSEN_BIC": f"{_IDENTIFICATION}.model_choice",
     "_MOST_ROUNDS": f"{_IDENTIFICATION}.model_error_search",
     "_PLAIN_POLES": f"{_IDENTIFICATION}.model_error_search",
     "_UNDECIDED": f"{_IDENTIFICATION}.model_error_search",

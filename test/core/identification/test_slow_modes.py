@@ -12,6 +12,7 @@ from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
 from omsm_ros.core.identification.model_error_search import search_model_errors
+from omsm_ros.core.kinematics.trajectories import s_curve
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.model_errors.families import MODE, VIBRATION
 from omsm_ros.core.model_errors.undetected import alternative_mode_covariance
@@ -86,3 +87,21 @@ def test_a_slow_line_of_vibration_is_no_mode():
     found = search_model_errors(prepare(late_record(line), "encoder"), model_from_start)
     assert {modelled.term.family for modelled in found.nuisance_terms} == {VIBRATION}
     assert not found.added_poles
+
+
+def test_a_light_mode_that_rings_through_every_rest_is_no_friction():
+    """Of 12 Hz and 0.5 %: two poles and friction do not describe it better than its own three."""
+    edges, rng, omega = np.random.default_rng(127), np.random.default_rng(50), 2 * np.pi * 12
+    starts = 0.4 + 0.52 * np.arange(20) + edges.uniform(0, PERIOD, 20)
+    finer = 2.5e-5
+    time = np.arange(0, starts[-1] + 0.52, finer)
+    height = np.where(np.arange(20) < 10, 10e-6, -10e-6)
+    z = s_curve(np.clip((time[:, np.newaxis] - starts) / 20e-3, 0, 1)) @ height
+    downs = np.polymul([omega**-2, 0.01 / omega, 1.0], [0.3e-3, 1.0])
+    up, down, _ = signal.cont2discrete(([1.0], downs), finer, "foh")
+    seen = signal.lfilter(up.ravel(), down, z)[::40]
+    rng.uniform(), rng.normal(size=int((starts[-1] + 0.52) / PERIOD))  # a seed that looked so
+    noise = rng.normal(0, 10e-9, len(seen))
+    found = identify(record_from_arrays(PERIOD, z[::40], noise - seen)).calibration.certificate
+    assert found.findings == ()
+    assert found.structure.poles == 3
