@@ -1,12 +1,12 @@
 """Covariance of fitted parameters in coloured noise."""
 
 import numpy as np
-from scipy import fft, ndimage
+from scipy import fft, linalg, ndimage
 
 from omsm_ros.core.estimation.noise import RandomWalk, scatter_in_time, uneven_rows, with_walk
 from omsm_ros.core.estimation.output_error import Fit, Problem
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.linear_algebra import BLOCK_VALUES, orthonormal
 
 # Two orders for each of six lines of hum.
@@ -190,3 +190,28 @@ def inter_sample_motion_covariance(
         elif power == 1:
             directions[row, -1] = size / np.sqrt(3)
     return directions.T @ directions
+
+
+def with_random_walk(
+    columns: FloatArray, values: FloatArray, first: BoolArray, walked: FloatArray
+) -> tuple[float, float, float]:
+    """Return the restricted log likelihood, the first coefficient and its standard uncertainty.
+
+    In white noise of variance 1 and a random walk: differences of neighbours have a covariance of
+    three diagonals. first: of a recording (k,);  walked: variance of each step of the walk (k,)
+    """
+    both = np.column_stack([columns, values])
+    both = both - np.where(first[:, np.newaxis], 0.0, np.roll(both, 1, axis=0))
+    bands = np.stack([np.where(first, 1.0, 2.0) + walked, np.append(first[1:] - 1.0, 0.0)])
+    factor = linalg.cholesky_banded(bands, lower=True)
+    both = linalg.solve_banded((1, 0), factor, both)
+    q, r = np.linalg.qr(both[:, :-1])
+    residual = both[:, -1] - q @ (q.T @ both[:, -1])
+    inverse, degrees = np.linalg.pinv(r), max(len(values) - columns.shape[1], 1)
+    variance = max(float(residual @ residual) / degrees, float(np.finfo(np.float64).tiny))
+    spread = float(np.sum(np.log(factor[0]))) + float(np.linalg.slogdet(r)[1])
+    return (
+        -0.5 * degrees * float(np.log(variance)) - spread,
+        float(inverse[0] @ (q.T @ both[:, -1])),
+        float(np.sqrt(variance * (inverse[0] @ inverse[0]))),
+    )

@@ -23,7 +23,6 @@ from itertools import pairwise
 from typing import Any, ParamSpec
 
 import numpy as np
-from scipy import linalg
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import (
@@ -41,6 +40,7 @@ from omsm_ros.core.calibration.certificate import (
 )
 from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse
 from omsm_ros.core.calibration.latency import unresolved_latency
+from omsm_ros.core.estimation.covariance import with_random_walk
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Fit
 from omsm_ros.core.estimation.preparation import Prepared, check_axis_steps, check_gain, prepare
@@ -74,7 +74,7 @@ from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.model_errors.families import DRIFT, MODE
 from omsm_ros.core.model_errors.residual_diagnostics import Contrast, contrasts
 from omsm_ros.core.model_errors.undetected import alternative_mode_covariance
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, IdentificationError, StepTestError
 from omsm_ros.linear_algebra import one_blas_thread, unit_columns
@@ -474,31 +474,6 @@ def _ratio(
     unit, scale = unit_columns(columns)
     first = np.diff(part[known], prepend=-1) != 0
     walked = np.where(first, t, np.diff(t, prepend=0.0)) / t[-1]
-    tried = [_weighted(unit, y, first, share * walked) for share in _WALK_SHARES]
+    tried = [with_random_walk(unit, y, first, share * walked) for share in _WALK_SHARES]
     _, solved, uncertainty = max(tried)
     return GainEstimate(abs(solved) / float(scale[0]), uncertainty / float(scale[0]))
-
-
-def _weighted(
-    columns: FloatArray, values: FloatArray, first: BoolArray, walked: FloatArray
-) -> tuple[float, float, float]:
-    """Return the restricted log likelihood, the first coefficient and its standard uncertainty.
-
-    In white noise of variance 1 and a random walk: differences of neighbours have a covariance of
-    three diagonals. first: of a recording (k,);  walked: variance of each step of the walk (k,)
-    """
-    both = np.column_stack([columns, values])
-    both = both - np.where(first[:, np.newaxis], 0.0, np.roll(both, 1, axis=0))
-    bands = np.stack([np.where(first, 1.0, 2.0) + walked, np.append(first[1:] - 1.0, 0.0)])
-    factor = linalg.cholesky_banded(bands, lower=True)
-    both = linalg.solve_banded((1, 0), factor, both)
-    q, r = np.linalg.qr(both[:, :-1])
-    residual = both[:, -1] - q @ (q.T @ both[:, -1])
-    inverse, degrees = np.linalg.pinv(r), max(len(values) - columns.shape[1], 1)
-    variance = max(float(residual @ residual) / degrees, float(np.finfo(np.float64).tiny))
-    spread = float(np.sum(np.log(factor[0]))) + float(np.linalg.slogdet(r)[1])
-    return (
-        -0.5 * degrees * float(np.log(variance)) - spread,
-        float(inverse[0] @ (q.T @ both[:, -1])),
-        float(np.sqrt(variance * (inverse[0] @ inverse[0]))),
-    )
