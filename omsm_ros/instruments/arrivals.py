@@ -115,7 +115,7 @@ class DeviceClock:
             while device + late - sum(self._spans[0][1:]) > WINDOW_S:
                 self._spans.popleft()
             _, x, y = np.array(self._spans).T
-            self._offset, self._slope, rest, _ = _line_below(x, y)
+            self._offset, self._slope, rest = _line_below(x, y)
             self._usual = float(np.median(rest))
         self._offset += min(late - self._offset - self._slope * device, 0.0)
 
@@ -131,12 +131,11 @@ class DeviceClock:
         return min(device - since, device + late - arrived) > _STEP_AFTER_S
 
 
-def _line_below(x: FloatArray, y: FloatArray) -> tuple[float, float, FloatArray, float]:
+def _line_below(x: FloatArray, y: FloatArray) -> tuple[float, float, FloatArray]:
     """Return offset, slope and rests (n,) of the likeliest line below the points.
 
-    The last value is how unlikely its slope is by itself (log). The rests are exponentially
-    distributed, with an unknown mean, the slopes normally. A busy host delays all arrivals of about
-    a second, so only one rest a second counts.
+    The rests are exponentially distributed, with an unknown mean, the slopes normally. A busy host
+    delays all arrivals of about a second, so only one rest a second counts.
     """
     drift, uncertainty = _expected_drift(x, y)
     slopes = np.append(_slopes_below(x, y), drift)
@@ -145,8 +144,7 @@ def _line_below(x: FloatArray, y: FloatArray) -> tuple[float, float, FloatArray,
     unlikely = ((slopes - drift) / uncertainty) ** 2 / 2
     best = np.argmin(len(x) * _SPAN_S * np.log(mean) + unlikely)
     offset, slope = float(offsets[best]), float(slopes[best])
-    other_rate = _OTHER_RATE if drift else 0.0
-    return offset, slope, y - slope * x - offset, float(unlikely[best]) + other_rate
+    return offset, slope, y - slope * x - offset
 
 
 def _slopes_below(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -191,15 +189,22 @@ _SPANS, _LATEST = 50, 60
 _LEAST_SPANS, _SHOWING, _OPEN = 8, 3, 5
 # Missed triggers are excluded, not likelier than none, and of a certain number by this (log).
 _EXCLUDED, _POSSIBLE, _CERTAIN = 6.0, 1.0, 12.0
+# A trigger is missed at any time alike, so the largest share of a start in which one would not be
+# seen is the largest chance that it was missed there.
+_UNSEEN = 0.1
 # Without a reference, so short a time before a pause is taken to be without missed triggers [s].
 _UNKNOWN_S = 1.0
-# The last sample of a portion may be nearly a period old: the lateness that confirms [period].
+# The last sample of a portion may be nearly a period old: the lateness that confirms, and that of
+# an age that stays [period].
 _LATE_PERIODS, _AGE_PERIODS = 0.75, 0.25
-# Spans among whose earliest arrivals two are nearly in time, as a rule. The limit for scattered
-# arrivals is this multiple of their difference.
-_WINDOW, _USUAL = 4, 2.0
-# Resolution of arrivals [period].
-_NARROWEST = 0.01
+# Parts by which the delay may change instead [period].
+_PARTS = (-0.3, -0.2, -0.1, 0.1, 0.2, 0.3)
+# Spans among whose earliest arrivals two are nearly in time, as a rule.
+_WINDOW = 4
+# Widths of the steps of a density of arrivals above their line, from their resolution on [period].
+_WIDTHS = np.append(0.0, 0.01 * 2.0 ** np.arange(20))
+_RISING = np.triu(np.ones((len(_WIDTHS), len(_WIDTHS)), bool), 1)
+_ACROSS = np.where(_RISING, _WIDTHS - _WIDTHS[:, np.newaxis], 1.0)
 
 
 class MissedTriggerDetector:
@@ -266,9 +271,9 @@ class MissedTriggerDetector:
         return self._counted + self._reference.missed
 
     @property
-    def seen_from(self) -> int:
+    def least_missed(self) -> int:
         """Return the least number of missed triggers that arrivals show; 0 = none do."""
-        return self._reference.seen_from
+        return self._reference.least_missed
 
     def forget_missed(self) -> int:
         """Return the number of missed triggers if it is certain, else 0.
@@ -285,6 +290,8 @@ class MissedTriggerDetector:
 # Square of the mean resultant length of phases above which arrivals are locked to the trigger: some
 # phases are then 1.6 times as frequent as others, or more.
 _LOCKED = 0.1
+# Crystals differ by less than this multiple of their standard deviation.
+_CRYSTAL_SIGMAS = 5.0
 # Arrivals later than the earliest of their span by more were delayed [period].
 _EARLY_PERIODS = 2.0
 
@@ -293,14 +300,15 @@ class _Phases:
     """Phases of arrivals within the period of the trigger, and whether they are locked to it.
 
     A host that polls at its own times sees each age of the last sample equally often. If its polls
-    keep step with the trigger, the age stays, or grows slowly until it falls by a whole period.
-    That looks like a missed trigger.
+    keep step with the trigger, or drift against it no faster than a crystal, the age stays, or
+    changes slowly until it jumps by a whole period. That looks like a missed trigger.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, period: float) -> None:
+        self._period = period
         self._begin, self._lates = -math.inf, list[float]()  # of the current span
-        self._means: deque[complex] = deque(maxlen=_LATEST)
-        self.locked = False  # whether the phases of successive spans agree
+        self._means: deque[tuple[float, complex]] = deque(maxlen=_LATEST)  # time [s], of a span
+        self.locked = False
 
     def add(self, late: float, arrival: float) -> None:
         """Enter an arrival;  late: [period];  arrival: [s]."""
@@ -312,10 +320,13 @@ class _Phases:
 
     def _end_span(self, late: FloatArray) -> None:
         early = late[late < late.min() + _EARLY_PERIODS]  # a delay says nothing of the age
-        self._means.append(complex(np.exp(2j * np.pi * early).mean()))
-        means = np.array(self._means)
-        alike = np.real(means[1:] * means[:-1].conj())
-        self.locked = len(alike) > 0 and float(alike.mean()) > _LOCKED
+        self._means.append((self._begin, complex(np.exp(2j * np.pi * early).mean())))
+        begin, means = np.array(self._means).T
+        since = (begin - begin[0]).real / self._period
+        most = _CRYSTAL_SIGMAS * _DRIFT_SIGMA
+        drifts = np.linspace(-most, most, 2 * math.ceil(2 * most * since[-1]) + 1)
+        common = np.exp(-2j * np.pi * np.outer(drifts, since)) @ means / len(means)
+        self.locked = len(means) > 1 and float(np.max(abs(common)) ** 2) > _LOCKED
 
 
 class _Reference:
@@ -323,6 +334,7 @@ class _Reference:
 
     begin: of its first span [s];  confirmed: last arrival that was not late [s]
     proven: no step by missed triggers explains the arrivals
+    lost: the age of arrivals in step with the trigger changed by a period, or triggers were missed
     found: number of missed triggers, if it became certain with the last arrival
     """
 
@@ -330,11 +342,11 @@ class _Reference:
         self._period = period
         self._earliest: list[tuple[float, float]] = []  # begin and lateness of each span [s]
         self._line = 0.0, 0.0  # lateness of the earliest at 0, drift
-        self._limit, self.seen_from = _LATE_PERIODS * period, 1
-        self.proven = False
+        self.least_missed = 1
+        self.proven = self.lost = False
         self.begin = self.confirmed = self._judged = 0.0
         self.found = 0
-        self._phases = _Phases()
+        self._phases = _Phases(period)
 
     def confirms(self, due: float, arrival: float) -> bool:
         """Return whether no trigger was missed before this arrival, as far as can be seen."""
@@ -355,10 +367,10 @@ class _Reference:
         self.begin = self.begin or arrival
         excess = self.excess(due, arrival)
         # The drift of crystals makes a line uncertain that is not confirmed any more.
-        aged = not self._phases.locked or not self.seen_from
-        limit = self._limit if aged else _AGE_PERIODS * self._period
+        limit = (_AGE_PERIODS if self._phases.locked else _LATE_PERIODS) * self._period
         limit -= 2 * _DRIFT_SIGMA * (arrival - self.confirmed)
-        if not self.proven or self.found or excess > limit or limit <= 0:
+        beyond = self.least_missed > 0 and (excess > limit or limit <= 0)
+        if not self.proven or self.found or self.lost or beyond:
             return False
         self.confirmed = arrival
         self._line = (self._line[0] + min(excess, 0.0), self._line[1])
@@ -395,83 +407,101 @@ class _Reference:
         known = int(np.searchsorted(begin, self.confirmed, "right"))
         if self.proven:
             self._set_line(known)
-        if len(begin) < max(_LEAST_SPANS, known + _SHOWING):
+            rest = (late - self._line[0] - self._line[1] * begin)[known:][-_SHOWING:] / self._period
+            if self._phases.locked and len(rest) == _SHOWING:
+                self.lost |= rest.min() > 1 - _AGE_PERIODS and np.ptp(rest) < _AGE_PERIODS
+        if self.lost or len(begin) < max(_LEAST_SPANS, known + _SHOWING):
             return
         waited = float(begin[-1]) - max(self.confirmed, self.begin)
         if begin[-1] - self._judged < max(_SPAN_S, waited / 10):
             return
         self._judged = float(begin[-1])
-        _, drift, rest, _ = _line_below(begin - begin[-1], late)
+        _, drift, rest = _line_below(begin - begin[-1], late)
         if not self.proven and abs(drift) > _GROSS:  # a backlog, or played in time lapse
             if waited < 0.7 * _UNKNOWN_S:  # else the end of a recording stays in doubt
                 return
-            self._limit, self.seen_from = math.inf, 0
+            self.least_missed = 0
         elif not self.proven:
-            self._set_limit(rest)
-            other_rate = abs(drift) > _LARGEST_CRYSTAL_DRIFT and waited < _OTHER_RATE_S
-            if other_rate or self.seen_from > 1:  # either would hide a missed trigger
-                return
-        missed = self._settle(known) if self.seen_from else 0
+            windows = np.sort(sliding_window_view(rest, _WINDOW), axis=1)
+            scatter = 2 * float(np.median(windows[:, 1] - windows[:, 0]))
+            self.least_missed = max(math.ceil(scatter / self._period + 0.5), 1)
+            if abs(drift) > _LARGEST_CRYSTAL_DRIFT and waited < _OTHER_RATE_S:
+                return  # missed triggers would look alike
+        locked = self._phases.locked or abs(drift) > _LARGEST_CRYSTAL_DRIFT
+        missed = self._settle(known, locked) if self.least_missed else 0
         if missed == 0 or (missed and self.proven):
             self.proven, self.confirmed = True, self._judged
+            self.least_missed = min(self.least_missed, 1)
             self._set_line(len(begin))
         self.found = missed or 0
 
-    def _settle(self, first: int) -> int | None:
+    def _settle(self, first: int, locked: bool) -> int | None:
         """Return how many triggers were missed from a span on, None if that is not certain.
 
         Arrivals after them are expected earlier from then on.
+
+        locked: a change by a period may be one of the age, so arrivals have to stay on the line
         """
         begin, late = np.array(self._earliest).T
-        since = begin - begin[-1]
-        *_, rest, unlikely = _line_below(since, late)
-        if self._phases.locked:  # an age that changes by a period looks like a step
-            off = (rest[:_SHOWING].min(), np.median(rest), rest[-_SHOWING:].min())
-            return 0 if max(off) <= _AGE_PERIODS * self._period else None
-        none, found = _edge(rest / self._period) - unlikely, []
-        level = late - self._line[1] * since
-        for at in range(max(first, 1), len(late)):
-            apart = float(rest[at:].min()), float(level[at:].min() - level[:at].min())
-            shown = {math.floor(each / self._period + _AGE_PERIODS) for each in apart}
-            for missed in {max(n, m) for n in shown for m in (1, n + 1, self.seen_from)}:
-                shifted = np.append(late[:at], late[at:] - missed * self._period)
-                *_, rests, unlikely = _line_below(since, shifted)
-                found.append((at, missed, _edge(rests / self._period) - unlikely - none))
-        steps, numbers, likely = np.array(found).T
-        at, best, most = found[int(np.argmax(likely))]
-        other = likely[numbers != best].max(initial=0.0)
-        if most - other > _CERTAIN:
+        since, periods = begin - begin[-1], late / self._period
+
+        def shifted(at: int, missed: float) -> tuple[float, FloatArray]:
+            moved = np.append(periods[:at], periods[at:] - missed)
+            return _likelihood(since, moved, self._period)
+
+        none, rest = shifted(0, 0)
+        steps = range(max(first, 1), len(late))
+        level = periods - self._line[1] / self._period * since
+        rise = max(level[at:].min() - level[:at].min() for at in steps)
+        likely: dict[int, FloatArray] = {}
+        wanted = {1, max(math.floor(rise + _AGE_PERIODS), 1)}
+        while wanted:  # the best number has neighbours that are less likely
+            for missed in wanted:
+                likely[missed] = np.array([shifted(at, missed)[0] - none for at in steps])
+            best = max(likely, key=lambda each: float(likely[each].max()))
+            wanted = {max(best - 1, 1), best + 1} - likely.keys()
+        most, at = float(likely[best].max()), steps[int(np.argmax(likely[best]))]
+        other = max([0.0, *(float(each.max()) for n, each in likely.items() if n != best)])
+        if most - other > _CERTAIN and not locked:
+            # No other change of the delay explains the step better than missed triggers.
+            if max(shifted(at, best + part)[0] for part in _PARTS) - none - most > _EXCLUDED:
+                return None
             moved = [(b, y - best * self._period) for b, y in self._earliest[at:]]
             self._earliest[at:] = moved
             return best
-        possible = steps[(likely > -_EXCLUDED) & (numbers >= self.seen_from)]
-        last = max(set(steps) - set(possible), default=0)
-        return 0 if most < _POSSIBLE and last >= len(late) - _OPEN else None
+        seen = np.max([*likely.values()], axis=0) < -_EXCLUDED
+        off = sliding_window_view(rest, _SHOWING).min(axis=1).max() if locked else 0.0
+        sure = most < _POSSIBLE and off <= _AGE_PERIODS and seen[-_OPEN:].any()
+        return 0 if sure and np.count_nonzero(~seen[:-_OPEN]) <= _UNSEEN * len(late) else None
 
     def _set_line(self, known: int) -> None:
         """Lay the highest line below the earliest arrivals of the first spans."""
         begin, late = np.array(self._earliest).T
         since = begin - begin[-1]
-        least, drift, *_ = _line_below(since[:known], late[:known])
+        least, drift, _ = _line_below(since[:known], late[:known])
         self._line = (least - drift * float(begin[-1]), drift)
-        if self.seen_from > 1:
-            # All arrivals count, or the limit would fall by leaving late ones out.
-            self._set_limit(late - least - drift * since, self._limit)
-
-    def _set_limit(self, rest: FloatArray, most: float = math.inf) -> None:
-        """Set the limit by the scatter of the rests above the line (n,), which no step explains."""
-        windows = np.sort(sliding_window_view(rest, _WINDOW), axis=1)
-        usual = _USUAL * float(np.median(windows[:, 1] - windows[:, 0]))
-        self.seen_from = max(math.ceil(usual / self._period + 2 * _AGE_PERIODS), 1)
-        self._limit = min((self.seen_from - _AGE_PERIODS) * self._period, most)
-        self.seen_from = math.ceil(self._limit / self._period)
 
 
-def _edge(rest: FloatArray) -> float:
-    """Return how likely arrivals with these rests (n,) above a line [period] lie at an edge (log).
+def _likelihood(x: FloatArray, y: FloatArray, period: float) -> tuple[float, FloatArray]:
+    """Return the log likelihood of arrivals above the likeliest line, and their rests (n,).
 
-    Without an edge an arrival is within a width w of the line by a chance of w. For the likeliest
-    number k of arrivals the log likelihood is -k log w; the two that define the line do not count.
+    x: times [s];  y: lateness [period], (n,)
+
+    Long delays are rarer than short ones, so the density of the rests falls. The likeliest one that
+    does is the slope of the least concave curve above their cumulative number (Grenander 1956),
+    here between ``_WIDTHS``. The two arrivals that define the line do not count.
     """
-    width = np.maximum(np.sort(rest)[2:], _NARROWEST)
-    return float(np.max(-np.arange(1, len(width) + 1) * np.log(width)))
+    drift, uncertainty = (each / period for each in _expected_drift(x, y * period))
+    slopes = np.append(_slopes_below(x, y), drift)
+    rests = y - slopes[:, np.newaxis] * x
+    rests -= rests.min(axis=1, keepdims=True)
+    late = np.sort(rests, axis=1)[:, 2:, np.newaxis]
+    number = np.count_nonzero(late <= np.append(-1.0, _WIDTHS[1:]), axis=1)
+    up = np.where(_RISING, (number[:, np.newaxis] - number[..., np.newaxis]) / _ACROSS, -np.inf)
+    most = np.maximum.accumulate(up[..., ::-1], axis=2)[..., ::-1]
+    density = np.where(_RISING, most, np.inf).min(axis=1)[:, 1:] / late.shape[1]
+    each = np.diff(number, axis=1)
+    likely = np.sum(each * np.log(np.where(each, density, 1.0)), axis=1)
+    likely -= ((slopes - drift) / uncertainty) ** 2 / 2
+    best = int(np.argmax(likely))
+    return float(likely[best]) - (_OTHER_RATE if drift else 0.0), rests[best]

@@ -88,6 +88,7 @@ class BlockCutter:
         because no arrival confirms that no trigger was missed before them
     restarted_at_zero: the encoders lost their positions with a restart, so nothing is handed over
     perhaps_at_zero: they are at zero after a silence, as after a restart or a move to the origin
+    detector: of missed triggers; None where arrivals are not watched
     unconfirmed: samples are withheld because triggers may have been missed before them
     period_deviation: relative, from nominal: of the last full block's device time, or of the
         arrivals of a device without time stamps [1]
@@ -106,7 +107,7 @@ class BlockCutter:
         together = channels.distance and channels.axes is not None
         watched = not (channels.timed or settings.free_running or together)
         period, pause = settings.sample_period, settings.pause
-        self._detector = MissedTriggerDetector(period, pause) if watched else None
+        self.detector = MissedTriggerDetector(period, pause) if watched else None
         # Arrival, the same by the clock of the stamps, whether after a silence.
         self._waiting: deque[tuple[float, int, bool, list[CountedRun]]] = deque()
         self._counts = np.zeros(len(AXES), np.int64)  # of the last sample
@@ -125,16 +126,6 @@ class BlockCutter:
         """Return the number of samples that wait for their block, or for later arrivals."""
         waiting = (run for *_, runs in self._waiting for run in runs)
         return len(self._pending) + sum(len(run.samples) for run in waiting)
-
-    @property
-    def missed(self) -> int:
-        """Return the triggers without a sample of the device, by the arrivals of the others."""
-        return self._detector.missed if self._detector else 0
-
-    @property
-    def least_missed(self) -> int:
-        """Return the least number of missed triggers that is detected; 0 = not by arrivals."""
-        return self._detector.seen_from if self._detector else 0
 
     @property
     def wrong_rate(self) -> bool:
@@ -170,22 +161,22 @@ class BlockCutter:
 
         arrival_ns: by the clock of the stamps;  now: the same, monotonic [s]
         """
-        if self._detector is None or not runs:
+        if self.detector is None or not runs:
             yield from self._cut(runs, arrival_ns, after_silence)
             return
         if any(run.restarted for run in runs):
             self.withhold()
             self._skipped = 0
-            self._detector.restart()
+            self.detector.restart()
         runs = [replace(run, first_sample=run.first_sample + self._skipped) for run in runs]
         self._waiting.append((now, arrival_ns, after_silence, runs))
         due = (runs[-1].first_sample + len(runs[-1].samples) - 1) * self._settings.sample_period
-        if self._detector.confirms(due, now, after_silence=after_silence):
-            yield from self._release(self._detector)
-        elif missed := self._detector.forget_missed():
+        if self.detector.confirms(due, now, after_silence=after_silence):
+            yield from self._release(self.detector)
+        elif missed := self.detector.forget_missed():
             self.withhold()
             self._skipped += missed
-        patience = _LONG_S if self._detector.missed else _LONGEST_S
+        patience = _LONG_S if self.detector.missed else _LONGEST_S
         self.unconfirmed |= bool(self._waiting) and self._waiting[0][0] < now - patience
         self.withhold(now - _LONGEST_S)
 
@@ -200,8 +191,8 @@ class BlockCutter:
 
     def end(self) -> Iterator[BlockPair]:
         """Yield what is left at the end of the stream, or before a long pause."""
-        if self._detector is not None and self._detector.trusts_last():
-            yield from self._release(self._detector)
+        if self.detector is not None and self.detector.trusts_last():
+            yield from self._release(self.detector)
         yield from self.flush()
 
     def withhold(self, until: float = np.inf) -> None:
@@ -247,7 +238,7 @@ class BlockCutter:
         after_silence: bool,
     ) -> None:
         """Enter the arrival of the last sample before a restart of the device."""
-        may_pause = not (self._channels.timed or self._settings.free_running or self._detector)
+        may_pause = not (self._channels.timed or self._settings.free_running or self.detector)
         if runs[0].restarted or (after_silence and may_pause):
             self._clock.restart()
         anew = (i for i, run in enumerate(runs) if i and run.restarted)

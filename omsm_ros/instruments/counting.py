@@ -6,7 +6,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -324,8 +324,7 @@ class SequenceTracker:
         return max(0, round(turns))
 
 
-@dataclass(frozen=True, slots=True)
-class _StreamBreak:
+class _StreamBreak(NamedTuple):
     elapsed: float = 0.0
     broken: bool = False
 

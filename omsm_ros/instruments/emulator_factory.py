@@ -267,34 +267,23 @@ OWN_ENCODERS: dict[str, object] = {"trigger": "each", "probe.zero": TWIN_READING
 
 
 @dataclass(frozen=True, slots=True)
-class SecondDevice:
-    """A second device of the same trigger.
-
-    node: whose parameters ``driver`` are
-    make: as of ``Emulated``
-    part: returns the recording of a motion as this device measures it
-    tcp: it needs a TCP port
-    """
-
-    node: str
-    make: Callable[..., Instrument]
-    driver: dict[str, object]
-    part: Callable[[Recording], Recording] = lambda recording: recording
-    tcp: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class Emulated:
-    """make: returns the device on a line;  driver: parameters a driver needs to read it;
+    """An emulated device, or the second one of the same trigger.
+
+    make: returns the device on a line;  driver: parameters a driver needs to read it
     tcp: it needs a TCP port, where others also work on a serial one;  second: another device
     baud_rate: its line has no more, so a demonstration is slow, and small [bit/s]; 0 = any
+    node: whose parameters ``driver`` are
+    part: returns the recording of a motion as this device measures it
     """
 
     make: Callable[..., Instrument]
     driver: dict[str, object]
     tcp: bool = False
-    second: SecondDevice | None = None
+    second: Emulated | None = None
     baud_rate: int = 0
+    node: str = "confocal_driver"
+    part: Callable[[Recording], Recording] = lambda recording: recording
 
 
 EMULATED = tuple(name for name, model in (PROBES | REFERENCES).items() if model.emulator)
@@ -381,7 +370,7 @@ def player_for(
 ) -> Player:
     """Return what plays motions on ``line``, and on the line of the ``second`` device, if any."""
     known, faults = emulated(device), faults or InstrumentFaults()
-    devices = [(known.make(line, triggered=True, seed=seed), lambda recording: recording)]
+    devices = [(known.make(line, triggered=True, seed=seed), known.part)]
     if known.second is not None and second is not None:
         devices.append((known.second.make(second, triggered=True), known.second.part))
     for one, _ in devices:

@@ -37,6 +37,7 @@ class StreamStatistics:
     withheld: kept back because the device runs at another rate than it was set to, its encoders
         lost their positions, or no arrival confirms that it missed no trigger before them
     missed: triggers without a sample of this device, by the arrivals (``MissedTriggerDetector``)
+    least_missed: the least number of them that the arrivals show; 0 = none do
     lost, gaps: trigger counts that never arrived, and in how many places
     restarts: how often the device's counter or clock fell back
     resets: how many of these came after a silence, with the connection kept: the counter was reset
@@ -226,9 +227,9 @@ class StreamDevice:
     @property
     def statistics(self) -> StreamStatistics:
         """Return the counts of all samples."""
-        owners = (self, self._tracker, self._cutter)
+        owners = (self, self._tracker, self._cutter, self._cutter.detector)
         found = {
-            each.name: next(getattr(o, each.name) for o in owners if hasattr(o, each.name))
+            each.name: next((getattr(o, each.name) for o in owners if hasattr(o, each.name)), 0)
             for each in fields(StreamStatistics)
         }
         return StreamStatistics(**found)

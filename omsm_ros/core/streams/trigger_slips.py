@@ -326,10 +326,8 @@ class TriggerSlipDetector:
 
     def _recent(self) -> FloatArray | None:
         """Return the rows of :class:`StampHistory` to be judged; None if too few."""
-        return self._seen.recent(self._first_judged(), self._since, _LEAST_STAMPS)
-
-    def _first_judged(self) -> float:
-        return self._start + _FIRST_S * NANOSECONDS_PER_S / self._period_ns
+        first = self._start + _FIRST_S * NANOSECONDS_PER_S / self._period_ns
+        return self._seen.recent(first, self._since, _LEAST_STAMPS)
 
     def _steady(self) -> float:
         return _steady(self._trigger, self._period_ns / NANOSECONDS_PER_S)

@@ -13,13 +13,7 @@ import numpy as np
 
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.instruments.emulator import Instrument, Measured
-from omsm_ros.instruments.emulator_factory import (
-    OWN_ENCODERS,
-    TWIN_READING,
-    Emulated,
-    SecondDevice,
-    reference_in,
-)
+from omsm_ros.instruments.emulator_factory import OWN_ENCODERS, TWIN_READING, Emulated, reference_in
 from omsm_ros.instruments.micro_epsilon.protocol import (
     VALUE_BITS,
     MeasurementBlock,
@@ -114,7 +108,7 @@ SERIAL = Emulated(
     partial(ConfocalDtSerialEmulator, probe=TWIN_READING),
     {"signals": "distance intensity counter", "trigger": "each", "probe.zero": TWIN_READING.zero},
     # RS-422 carries the distance alone, so the axes come from a device of their own.
-    second=SecondDevice("axis_driver", SixChannelEmulator, {"device": "six_channel"} | SCALES),
+    second=Emulated(SixChannelEmulator, {"device": "six_channel"} | SCALES, node="axis_driver"),
     baud_rate=691_200,
 )
 # Y and B stand still in the twin's motions: three encoders are enough.
@@ -128,11 +122,11 @@ _CAPACITIVE_READING = ProbeReading(
 CAPACITIVE = Emulated(
     SixChannelEmulator,
     {"device": "six_channel"} | SCALES,
-    second=SecondDevice(
-        "reference_driver",
+    second=Emulated(
         partial(CapaNcdtEmulator, probe=_CAPACITIVE_READING),
         {"device": "capancdt", "triggered": True, "probe.zero": _CAPACITIVE_READING.zero},
-        reference_in,
         tcp=True,
+        node="reference_driver",
+        part=reference_in,
     ),
 )
