@@ -466,8 +466,7 @@ class _Reference:
             # No other change of the delay explains the step better than missed triggers.
             if max(shifted(at, best + part)[0] for part in _PARTS) - none - most > _EXCLUDED:
                 return None
-            moved = [(b, y - best * self._period) for b, y in self._earliest[at:]]
-            self._earliest[at:] = moved
+            self._earliest[at:] = [(b, y - best * self._period) for b, y in self._earliest[at:]]
             return best
         seen = np.max([*likely.values()], axis=0) < -_EXCLUDED
         off = sliding_window_view(rest, _SHOWING).min(axis=1).max() if locked else 0.0
