@@ -262,8 +262,7 @@ class MissedTriggerDetector:
 
         So it is assumed of a short time; a longer one without an arrival in time is doubtful.
         """
-        trusted = self._reference.trusted_until(self._newest)
-        return trusted and self._after_pause is None and not self.lost
+        return not (self.lost or self._after_pause) and self._reference.trusted_until(self._newest)
 
     @property
     def missed(self) -> int:
@@ -287,11 +286,8 @@ class MissedTriggerDetector:
         return found
 
 
-# Square of the mean resultant length of phases above which arrivals are locked to the trigger: some
-# phases are then 1.6 times as frequent as others, or more.
+# Square of the mean resultant length of phases above which arrivals keep step with the trigger.
 _LOCKED = 0.1
-# Crystals differ by less than this multiple of their standard deviation.
-_CRYSTAL_SIGMAS = 5.0
 # Arrivals later than the earliest of their span by more were delayed [period].
 _EARLY_PERIODS = 2.0
 
@@ -323,7 +319,7 @@ class _Phases:
         self._means.append((self._begin, complex(np.exp(2j * np.pi * early).mean())))
         begin, means = np.array(self._means).T
         since = (begin - begin[0]).real / self._period
-        most = _CRYSTAL_SIGMAS * _DRIFT_SIGMA
+        most = 5 * _DRIFT_SIGMA  # crystals differ by less
         drifts = np.linspace(-most, most, 2 * math.ceil(2 * most * since[-1]) + 1)
         common = np.exp(-2j * np.pi * np.outer(drifts, since)) @ means / len(means)
         self.locked = len(means) > 1 and float(np.max(abs(common)) ** 2) > _LOCKED
@@ -456,8 +452,7 @@ class _Reference:
         likely: dict[int, FloatArray] = {}
         wanted = {1, max(math.floor(rise + _AGE_PERIODS), 1)}
         while wanted:  # the best number has neighbours that are less likely
-            for missed in wanted:
-                likely[missed] = np.array([shifted(at, missed)[0] - none for at in steps])
+            likely |= {n: np.array([shifted(at, n)[0] - none for at in steps]) for n in wanted}
             best = max(likely, key=lambda each: float(likely[each].max()))
             wanted = {max(best - 1, 1), best + 1} - likely.keys()
         most, at = float(likely[best].max()), steps[int(np.argmax(likely[best]))]
@@ -475,9 +470,8 @@ class _Reference:
 
     def _set_line(self, known: int) -> None:
         """Lay the highest line below the earliest arrivals of the first spans."""
-        begin, late = np.array(self._earliest).T
-        since = begin - begin[-1]
-        least, drift, _ = _line_below(since[:known], late[:known])
+        begin, late = np.array(self._earliest[:known]).T
+        least, drift, _ = _line_below(begin - begin[-1], late)
         self._line = (least - drift * float(begin[-1]), drift)
 
 
