@@ -49,3 +49,9 @@ def test_correcting_loads_neither_ros_nor_the_parts_of_scipy_for_searches() -> N
     heavy = ["scipy.io", "scipy.cluster", "rclpy", "omsm_msgs", "matplotlib", "control", "tqdm"]
     code = "import sys, omsm_ros.core.correction.correct; "
     assert run(code + f"print([m for m in {heavy} if m in sys.modules])") == "[]"
+
+
+def test_a_live_node_loads_what_makes_its_filters_before_samples_come() -> None:
+    pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+    code = "import sys, omsm_ros.nodes.corrector_node; print('scipy.signal' in sys.modules)"
+    assert run(code) == "True"

@@ -11,7 +11,7 @@ above it, and non-linear errors everywhere.
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy  # whose parts are loaded when they are used
+from scipy import signal  # which a live node loads here, before samples come
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.motion_filter import SETTLED
@@ -100,7 +100,7 @@ def _missed_above(up_to: float, digital: DigitalFilter, z: FloatArray) -> FloatA
         return np.zeros(len(z))
     centred = z - z[0]
     # Cut by the length of the kernel, where the ends of the record would count as motion.
-    fast = centred[half:-half] - scipy.signal.oaconvolve(centred, kernel, "valid")
+    fast = centred[half:-half] - signal.oaconvolve(centred, kernel, "valid")
     span = round(_RUNNING_S / digital.sample_period)
     missed = running_mean((fast - through(digital, fast)) ** 2, span)
     return np.pad(missed, half, mode="edge")
@@ -114,7 +114,6 @@ def _band_kernel(up_to: float, sample_period: float, samples: int) -> FloatArray
     """
     if up_to >= 0.5 / sample_period:
         return np.ones(1)
-    signal = scipy.signal
     taps, beta = signal.kaiserord(_ATTENUATION_DB, 2 * (1 - _PASSED_SHARE) * up_to * sample_period)
     half = min(taps // 2, samples // 4)
     cutoff = (1 + _PASSED_SHARE) / 2 * up_to
