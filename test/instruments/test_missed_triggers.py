@@ -315,6 +315,25 @@ def test_polls_in_step_with_the_trigger_are_never_renumbered(seed: int, missed: 
     assert confirmed < at or not missed
 
 
+@pytest.mark.parametrize("latency", [1e-5, 2e-4])
+@pytest.mark.parametrize("at", [0.801, 1.401])
+def test_no_drift_of_the_line_hides_a_trigger_missed_by_samples_sent_one_by_one(
+    latency: float, at: float
+) -> None:
+    """Half a period of drift in the seconds after it would make all arrivals lie on one line."""
+    random, detector, period = np.random.default_rng(12), MissedTriggerDetector(5e-4), 5e-4
+    confirmed = []
+    for taken in np.arange(1, 5000) * 4 * period:
+        due = taken - period * (taken > at)
+        arrival = UPTIME_S + taken * (1 + 2e-5) + random.exponential(latency)
+        if detector.confirms(float(due), arrival):
+            confirmed.append(float(taken))
+        if (found := detector.forget_missed()) != 0:
+            assert found == 1
+            break
+    assert at / 2 < max(confirmed) < at
+
+
 def cut(
     missed_at: float = np.inf, stall: float = np.inf, pause: float = np.inf, level: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, BlockCutter]:
