@@ -69,7 +69,7 @@ class Drawn:
         chance = np.random.default_rng([seed, 7]).standard_normal(len(true))
         seen = replace(self.made, height=true + self.made.free(error) + self.root @ chance)
         alike = figures._resembled(seen, self.covariance, self.every, self.by_height, self.effects)
-        more = np.stack([np.zeros(len(true)), *(change for *_, change in alike)], axis=1)
+        more = np.stack([np.zeros(len(true)), *(change for _, change in alike)], axis=1)
         pv, rms = seen.pv_and_rms(more)
         to_terms = self.by_height[self.kept]
         spread = np.diag(self.term_covariance) + np.sum((to_terms @ more) ** 2, axis=1)

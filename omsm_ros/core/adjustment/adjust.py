@@ -214,7 +214,7 @@ def adjust(
         enough, 2 * form.pv.uncertainty, accuracy,
         None if enough else best_addition(scans[0], priors, surface, removed),
         calibration,
-        largest_contribution(made, effects, doubts, accuracy),
+        largest_contribution(made, effects, doubts, form.alike, accuracy),
     )  # fmt: skip
     return Adjustment(
         form=form,

@@ -29,9 +29,8 @@ class Evidence:
     values: by the scans alone, of each column (size,) [unit]; 0 where nothing is shown
     chi_square, dof: against the declared size, of the directions that the scans show
     effect: rms of the family's share of the heights [m], by ``values``
-    gain: twice the logarithm by which the likelihood grows if the prior has the size ``wide``, or
-        that which was found, instead of the declared one; a family that could explain anything
-        gains less (Occam)
+    gain: twice the logarithm by which the likelihood grows if the prior has the size ``wide``
+        instead of the declared one; a family that could explain anything gains less (Occam)
     free: root of the covariance (size, size) that the scans leave if the declaration is worth
         nothing, and the family may be as large as ``wide``
     declared: True if it takes part by a declared size or a default
@@ -96,7 +95,7 @@ def _of_declared(solution: Solution, family: Family) -> Evidence:
     values = size * (axes @ alone)
     free = size[:, np.newaxis] * axes / np.sqrt(np.maximum(taken, 0.0) / share + wide**-2)
     gain = sum(
-        _gain((m / t) ** 2, o + 1.0, o + max(w**2, (m / t) ** 2))
+        _gain((m / t) ** 2, o + 1.0, o + w**2)
         for m, t, o, w in zip(moved[shown], taken[shown], own[shown], wide[shown], strict=True)
     )
     tested = chi_square, int(np.sum(shown)), gain
@@ -130,7 +129,7 @@ def _of_absent(solution: Solution, family: Family) -> Evidence:
     chi_square = float(np.sum(np.where(shown, moved**2 / known, 0.0)))
     ratio = (family.wide * np.median(scale)) ** 2
     gain = sum(
-        _gain(m**2 / i**2, 1 / i, 1 / i + max(ratio, m**2 / i**2))
+        _gain(m**2 / i**2, 1 / i, 1 / i + ratio)
         for m, i in zip(moved[shown], information[shown], strict=True)
     )
     tested = chi_square, int(np.sum(shown)), gain

@@ -18,7 +18,7 @@ import scipy  # whose parts are loaded when they are used
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.network import Solution, solve
 from omsm_ros.core.adjustment.part_terms import FREE_M, FormTerms
-from omsm_ros.core.adjustment.refutation import ODDS_ABSENT, POSITIVE, SURE, Doubt
+from omsm_ros.core.adjustment.refutation import Doubt, probabilities
 from omsm_ros.core.adjustment.sources import FREE, Family, base_name
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
@@ -56,8 +56,8 @@ class FormMap:
     pv, rms: figures;  terms: of degree 2 to 4 on ``disc``, coefficients one at its rim [m], and
         their covariance [m²]
     removed: names of the pose, with their values ``pose`` [m], [1], [rad]
-    resembled: families that the form looks like, the likeliest first, with what each may do to it,
-        k = 1, rms over the part [m]
+    alike: families that the form looks like, the likeliest first, with the change of the map that
+        each may have made, k = 1 (n,) [m]
     """
 
     x: FloatArray
@@ -73,12 +73,17 @@ class FormMap:
     term_covariance: FloatArray
     removed: tuple[str, ...]
     pose: FloatArray
-    resembled: tuple[tuple[str, float], ...] = ()
+    alike: tuple[tuple[str, FloatArray], ...] = ()
 
     @property
     def uncertainty(self) -> FloatArray:
         """Standard uncertainty of each height (n,) [m]."""
         return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
+
+    @property
+    def resembled(self) -> tuple[tuple[str, float], ...]:
+        """Families that the form looks like, with what each may do to it, rms over the part [m]."""
+        return tuple((n, float(np.sqrt(self.area @ change**2))) for n, change in self.alike)
 
     @property
     def mean_uncertainty(self) -> float:
@@ -112,10 +117,10 @@ def form_map(
     covariance = made.free(made.free(raw).T)
     covariance += open_changes @ open_changes.T
     every, by_height = _term_fit(solution, places)
-    alike = _resembled(made, covariance, every, by_height, effects or {})
-    more = np.stack([np.zeros(len(made.height)), *(change for _, _, change in alike)], axis=1)
+    alike = tuple(_resembled(made, covariance, every, by_height, effects or {}))
+    more = made.open_changes((), alike)
     covariance += more @ more.T
-    pv, rms = made.pv_and_rms(np.concatenate([open_changes, more], axis=1))
+    pv, rms = made.pv_and_rms(made.open_changes(doubts, alike))
     terms, coefficients, term_covariance = _reported(made, doubts)
     shown = by_height[[every.index(t) for t in terms]] @ more
     return FormMap(
@@ -132,7 +137,7 @@ def form_map(
         term_covariance=term_covariance + shown @ shown.T,
         removed=made.removed,
         pose=made.pose,
-        resembled=tuple((name, _rms(places, change[:, np.newaxis])) for name, _, change in alike),
+        alike=alike,
     )
 
 
@@ -197,11 +202,12 @@ class Contribution:
 
 
 def largest_contribution(
-    made: FormOf, effects: Mapping[str, Effect], doubts: Sequence[Doubt], accuracy: float | None
-) -> Contribution | None:
-    """Return the source with the largest effect on the form, and the size that ``accuracy`` allows.
+    made: FormOf, effects: Mapping[str, Effect], doubts: Sequence[Doubt],
+    alike: Sequence[tuple[str, FloatArray]], accuracy: float | None,
+) -> Contribution | None:  # fmt: skip
+    """Return the source without which PV is known best, and the size that ``accuracy`` allows.
 
-    effects: of :func:`effects_on_form`;  doubts: as for :func:`form_map`
+    effects: of :func:`effects_on_form`;  doubts: as for :func:`form_map`;  alike: of its map
     accuracy: expanded uncertainty of PV asked for [m]; None, or more than there is: None
     """
     solution = made.solution
@@ -209,25 +215,32 @@ def largest_contribution(
              if f.name in effects and (f.named or f.name in FREE)]  # fmt: skip
     if accuracy is None or not known:
         return None
-    family = max(known, key=lambda f: effects[f.name].left)
-    part = _part(solution, family)
     errors, parameters = made.errors()
-    errors = made.with_changes(made.free(errors), made.open_changes(doubts))
-    covariance = solution.covariance[part, part]
-    through = made.free(made.rows[:, solution.active] @ solution.covariance[:, part])
-    own = through @ np.linalg.pinv(covariance, rcond=1e-10) @ parameters[part]
+    changes = made.open_changes(doubts, alike)
+    errors = made.with_changes(made.free(errors), changes)
+    resembled = {name: k - len(alike) for k, (name, _) in enumerate(alike)}
 
-    def excess(factor: float) -> float:
-        """Return U less ``accuracy`` where ``factor`` of the source is left [m]."""
-        return 2 * _figure(made.height, errors + (factor - 1) * own, _pv).uncertainty - accuracy
+    def own(family: Family) -> FloatArray:
+        found = effects[family.name].shape / family.wide @ parameters[_part(solution, family)]
+        if family.name in resembled:
+            k = resembled[family.name]
+            found += np.outer(changes[:, k], _chances(changes.shape[1])[k])
+        return np.asarray(found)
 
-    size = float(np.sqrt(np.mean(np.square(solution.sizes[family.name]))))
-    allowed, over = float("nan"), excess(0.0)
-    if excess(1.0) <= 0:
+    def excess(factor: float, share: FloatArray) -> float:
+        """Return U less ``accuracy`` where ``factor`` of a source is left [m]."""
+        return 2 * _figure(made.height, errors + (factor - 1) * share, _pv).uncertainty - accuracy
+
+    if excess(1.0, np.zeros_like(errors)) <= 0:
         return None
+    family = min(known, key=lambda f: excess(0.0, own(f)))
+    size = float(np.sqrt(np.mean(np.square(solution.sizes[family.name]))))
+    share = own(family)
+    allowed, over = float("nan"), excess(0.0, share)
     if over < 0:
-        factor = scipy.optimize.brentq(excess, 0.0, 1.0, rtol=1e-3)
+        factor = scipy.optimize.brentq(excess, 0.0, 1.0, args=(share,), rtol=1e-3)
         # The scans determine the rest: 1 / left² = 1 / size² + information.
+        covariance = solution.covariance_of(solution.network.place[family.name])
         left = float(np.mean(np.diag(covariance))) / size**2
         allowed = size / float(np.sqrt(1 + (factor**-2 - 1) / left))
     return Contribution(family.name, family.unit, size, allowed, over + accuracy)
@@ -302,18 +315,20 @@ class FormOf:
         rms = _figure(self.height, draws, lambda h: np.sqrt(self.places.area @ h**2))
         return _figure(self.height, draws, _pv), rms
 
-    def open_changes(self, doubts: Sequence[Doubt]) -> FloatArray:
-        """Return what ``doubts`` leave open, one standard uncertainty each, (n, k + 1) [m]."""
+    def open_changes(
+        self, doubts: Sequence[Doubt], alike: Sequence[tuple[str, FloatArray]] = ()
+    ) -> FloatArray:
+        """Return what ``doubts`` leave open, one standard uncertainty each, and last the changes
+        of ``alike``, (n, k + 1) [m]."""
         found = [np.zeros(len(self.height))]
         for doubt in doubts:
             before, after = (self.at(self.places, s) for s in (doubt.before, doubt.after))
             found.append(doubt.share * (after.height - before.height))
-        return np.stack(found, axis=1)
+        return np.stack([*found, *(change for _, change in alike)], axis=1)
 
     def with_changes(self, draws: FloatArray, changes: FloatArray) -> FloatArray:
         """Return ``draws`` (n, draws) with ``changes`` (n, k), each a normal deviate of its own."""
-        chance = np.random.default_rng([0, 1])
-        return draws + changes @ chance.standard_normal((changes.shape[1], _DRAWS))
+        return draws + changes @ _chances(changes.shape[1])
 
     def free(self, heights: FloatArray) -> FloatArray:
         """Return ``heights`` (n, …) without their pose."""
@@ -331,6 +346,11 @@ class FormOf:
         )
         errors = self.rows[:, solution.active] @ moved + self.member @ of_cells
         return np.asarray(errors), np.asarray(moved)
+
+
+def _chances(number: int) -> FloatArray:
+    """Return draws of ``number`` normal deviates, (number, draws), the same ones each time."""
+    return np.random.default_rng([0, 1]).standard_normal((number, _DRAWS))
 
 
 def _pv(heights: FloatArray) -> FloatArray:
@@ -456,12 +476,11 @@ def _reported(
 def _resembled(
     made: FormOf, covariance: FloatArray, terms: Sequence[ZernikeIndex], by_height: FloatArray,
     effects: Mapping[str, Effect],
-) -> list[tuple[str, float, FloatArray]]:  # fmt: skip
+) -> list[tuple[str, FloatArray]]:  # fmt: skip
     """Return families that the scans leave open and that the form speaks for, likeliest first.
 
-    Each has its name, twice the logarithm of its odds, and its change of the map as one standard
-    uncertainty (n,) [m]: as far as the form shows it, for no part cancels an error of the machine.
-    Of ten declarations that no scan shows one is wrong; of several such families one holds.
+    Each has its name, and its change of the map as one standard uncertainty (n,) [m]: as far as the
+    form shows it, for no part cancels an error of the machine.
     """
     if not np.any(made.height):
         return []
@@ -480,13 +499,10 @@ def _resembled(
             # Rounding of its many components would pass for information.
             shape, known = shape @ family.smooth, np.zeros((family.smooth.shape[1],) * 2)
         gain, values = form.looks_like(fit @ shape, known)
-        if gain > POSITIVE:
-            change = shape @ values
-            weight = made.places.area * change
-            shown = weight @ made.height / np.maximum(weight @ change, 1e-30)
-            if shown > 0:
-                found.append((family.name, gain, min(shown, 1.0) * change))
-    odds = np.exp([min(gain, SURE) / 2 for _, gain, _ in found])
-    roots = np.sqrt(odds / (ODDS_ABSENT + np.sum(odds)))
-    alike = [(name, gain, r * change) for (name, gain, change), r in zip(found, roots, strict=True)]
-    return sorted(alike, key=lambda one: -one[1])
+        change = shape @ values
+        weight = made.places.area * change
+        shown = weight @ made.height / np.maximum(weight @ change, 1e-30)
+        found.append((family.name, gain, float(np.clip(shown, 0.0, 1.0)) * change))
+    probable = probabilities([gain for _, gain, _ in found])
+    return [(found[k][0], np.sqrt(probable[k]) * found[k][2])
+            for k in np.argsort(-probable) if probable[k]]  # fmt: skip

@@ -21,6 +21,11 @@ from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zerni
 # Above degree 6 the variance of each degree is estimated: free terms would take what an error of
 # the spindle centre has beyond the regular ones (tried: to degree 10 they raise U by a half).
 FREE_DEGREE, HIGHEST_DEGREE = 6, 24
+# Waves of 2 to 3 mm on a part of 25 mm would pass for an error of the spindle centre, where all
+# angles meet. Only the lowest harmonics are large there, and above the twelfth no family acts.
+_FINE_DEGREE, _LOW_HARMONIC, _HIGHEST_HARMONIC = 40, 4, 12
+# Added to their degree, for polishing and turning leave more of them than of other harmonics.
+_LOW = 100
 # Among the variances that are estimated: rotationally symmetric terms above the free ones, for
 # turning leaves them, and the first octave of the rings.
 SYMMETRIC, RINGS = -1, -2
@@ -85,7 +90,11 @@ class PartModel:
     @property
     def degrees(self) -> IntArray:
         """Degree of each term and of the cone, or ``SYMMETRIC``; ``RINGS`` and below, (k,)."""
-        terms = [SYMMETRIC if t.m == 0 and t.n > FREE_DEGREE else t.n for t in self.terms]
+        n, m = np.array(self.terms).T
+        # Two degrees together have eight such terms, which determine their variance.
+        low = (n > FREE_DEGREE) & (np.abs(m) <= _LOW_HARMONIC)
+        terms = np.where(low, _LOW + n + n % 2, n)
+        terms[low & (m == 0)] = SYMMETRIC
         return np.array([*terms, _CONE, *(RINGS - self._octave)])
 
     def cell_of(self, x: FloatArray, y: FloatArray) -> IntArray:
@@ -118,6 +127,12 @@ def part_model(blocks: Blocks, turns: float, highest: int = HIGHEST_DEGREE) -> P
     radius = float(np.max(np.hypot(blocks.x - x, blocks.y - y)))
     rings = int(np.clip(turns // _TURNS_A_RING, _LEAST_RINGS, _MOST_RINGS))
     terms = terms_up_to(highest)
+    resolved = min(int(_WAVES_A_TURN * turns), _FINE_DEGREE)
+    if highest == HIGHEST_DEGREE < resolved:
+        terms = (
+            *(t for t in terms if abs(t.m) <= _HIGHEST_HARMONIC),
+            *(t for t in terms_up_to(resolved, highest + 1) if 0 < abs(t.m) <= _LOW_HARMONIC),
+        )
     about = np.hypot(blocks.x, blocks.y)
     waves = np.arange(FREE_DEGREE + 1, min(int(_WAVES_A_TURN * turns), _MOST_WAVES) + 1)
     empty = PartModel(

@@ -20,8 +20,6 @@ _UNDECLARED_LIMIT = 4.5
 _DECLARED_LIMIT = 3.7
 # Twice the logarithm of odds of 150 : 1, "very strong" (Kass and Raftery 1995).
 _LEAST_GAIN = 10.0
-# The same of odds of e : 1, "positive" evidence (the same table).
-POSITIVE = 2.0
 # Smaller than this no source matters to any accuracy asked of the method.
 _LEAST_EFFECT_M = 0.5e-9
 # Two explanations within this of each other in χ², or in their share of it, are not separated.
@@ -37,8 +35,11 @@ _OFFSET = "lag_change"
 _MOST_RELEASED = 8
 # Further culprits that are tried first.
 _MOST_TRIED = 3
-# Before the scans: of ten errors that nobody declared, a machine has one.
+# Before the scans: of ten errors that nobody declared, a machine has one; of ten adjustments, one
+# has a declaration that is wrong.
 ODDS_ABSENT, SURE = 9.0, 50.0
+# What is less probable lies outside an interval of 95 %.
+_LEAST_LIKELY = 0.05
 # No model excludes more; with a smaller prior, what the scans know of a family would be rounding.
 _LEAST_PROBABLE = 1e-6
 # Starting values; each step moves a variance by 30 at most, and four are enough for 2 %.
@@ -255,6 +256,19 @@ def _culprit(beyond: list[Evidence], avoided: Sequence[str]) -> Evidence:
     return min((e for e in named if e.gain >= named[0].gain - _ALIKE), key=lambda e: e.family.size)
 
 
+def probabilities(gains: Sequence[float]) -> FloatArray:
+    """Return how probable it is that each of several declarations is the one that is wrong, (k,).
+
+    Which of them, nothing tells before the scans: each has its share of the odds, so that many
+    declarations do not make one that looks wrong by chance more probable (J. G. Scott, J. O.
+    Berger, Ann. Statist. 38, 2587). Those below 5 % are 0.
+    gains: of their likelihoods (k,)
+    """
+    odds = np.exp(np.minimum(gains, SURE) / 2)
+    found = odds / (ODDS_ABSENT * max(len(odds), 1) + np.sum(odds))
+    return np.asarray(np.where(found > _LEAST_LIKELY, found, 0.0))
+
+
 def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Solution:
     """Return ``solution`` with every family taking part that has a name.
 
@@ -266,15 +280,18 @@ def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Sol
     that the likelihood alone would be too sure.
     """
     sizes: dict[str, float | FloatArray] = dict(solution.sizes)
-    for family in solution.network.families:
-        one, declared = evidence_of(solution, family), solution.sizes.get(family.name)
-        probable = 1 / (1 + ODDS_ABSENT * np.exp(-min(one.gain, SURE) / 2))
-        root = np.sqrt(max(probable, _LEAST_PROBABLE))
-        if family.named and declared is None:
+    named = [evidence_of(solution, f) for f in solution.network.families if f.named]
+    for one in named:
+        if not one.declared:
+            probable = 1 / (1 + ODDS_ABSENT * np.exp(-min(one.gain, SURE) / 2))
+            root = np.sqrt(max(probable, _LEAST_PROBABLE))
             size = root * np.hypot(one.values, one.uncertainty)
-            sizes[family.name] = np.minimum(size, family.wide)
-        elif family.named and declared is not None and one.gain > POSITIVE:
-            sizes[family.name] = np.hypot(declared, root * one.values)
+            sizes[one.family.name] = np.minimum(size, one.family.wide)
+    doubted = [e for e in named if e.declared and e.shown]
+    for one, probable in zip(doubted, probabilities([e.gain for e in doubted]), strict=True):
+        if probable:
+            name = one.family.name
+            sizes[name] = np.hypot(sizes[name], np.sqrt(probable) * one.values)
     for refutation in refutations:
         for other in refutation.rivals:
             share = explained(other, refutation.evidence)

@@ -31,7 +31,7 @@ KINDS = {
     "settling": {"settling": 150e-9},
     "height_step": {"height_step": 90e-9},
     "c_lost": {"c_lost": 5e-4},
-    "hum": {"hum": 20e-9},
+    "hum": {"hum": 25e-9},
     "floor": {"floor": 20e-9},
     "growth": {"growth": 300e-9},
     "wrong_sign": {"wrong_sign": 1.0},
