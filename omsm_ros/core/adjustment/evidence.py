@@ -73,78 +73,36 @@ class Evidence:
 
 def evidence_of(solution: Solution, family: Family) -> Evidence:
     """Return what the scans say of ``family``."""
-    if family.name in solution.sizes:
-        return _of_declared(solution, family)
-    return _of_absent(solution, family)
-
-
-def _of_declared(solution: Solution, family: Family) -> Evidence:
     here = solution.network.place[family.name]
-    size = np.broadcast_to(np.maximum(solution.sizes[family.name], 1e-15), family.size)
-    share, axes = np.linalg.eigh(solution.covariance_of(here) / np.outer(size, size))
-    share = np.clip(share, 1e-300, 1.0)
-    moved = axes.T @ (solution.values[here] / size)
-    taken = 1 - share
-    # By the data alone: variance once the prior is taken out again. A direction is tested if
-    # the scans know it better than its plausible size, however small the declared one is.
-    own = share / np.maximum(taken, _LEAST_TAKEN)
-    wide = np.sqrt(axes.T**2 @ np.maximum(family.wide / size, 1.0) ** 2)
-    shown = (taken > _LEAST_TAKEN) & (own < wide**2)
-    chi_square = float(np.sum(moved[shown] ** 2 / taken[shown]))
-    alone = np.where(shown, moved / np.where(shown, taken, 1.0), moved)
-    values = size * (axes @ alone)
-    free = size[:, np.newaxis] * axes / np.sqrt(np.maximum(taken, 0.0) / share + wide**-2)
-    gain = sum(
-        _gain((m / t) ** 2, o + 1.0, o + w**2)
-        for m, t, o, w in zip(moved[shown], taken[shown], own[shown], wide[shown], strict=True)
-    )
-    tested = chi_square, int(np.sum(shown)), gain
-    return _evidence(solution, family, values, tested, free)
-
-
-def _gain(square: float, before: float, after: float) -> float:
-    """Return the growth of 2 log L of a value of ``square`` from one variance to another."""
-    return float(square / before - square / after + np.log(before / after))
-
-
-def _of_absent(solution: Solution, family: Family) -> Evidence:
-    net = solution.network
-    here = net.place[family.name]
-    mixed = solution.matrix[here]
-    own = mixed[:, here]
-    score = solution.right[here] - mixed @ solution.values
-    explained = solution.factor.forward(mixed[:, solution.active].T)
-    left = own - explained.T @ explained
-    scale = np.sqrt(np.maximum(np.diag(own), 1e-300))
-    information, axes = np.linalg.eigh(left / scale / scale[:, np.newaxis])
-    # A direction known less well than its plausible size is not determined.
-    plausible = 1 / max(float(np.min(family.wide * scale)), _NO_COLUMN) ** 2
-    shown = information > max(_LEAST_LEFT, plausible)
-    moved = axes.T @ (score / scale)
-    known = np.where(shown, information, 1.0)
-    values = (axes @ np.where(shown, moved / known, 0.0)) / scale
-    # A direction that is not shown keeps the plausible size of the family.
-    variance = 1 / (np.maximum(information, 0.0) + plausible)
-    free = axes * np.sqrt(variance) / scale[:, np.newaxis]
-    chi_square = float(np.sum(np.where(shown, moved**2 / known, 0.0)))
-    ratio = (family.wide * np.median(scale)) ** 2
-    gain = sum(
-        _gain(m**2 / i**2, 1 / i, 1 / i + ratio)
-        for m, i in zip(moved[shown], information[shown], strict=True)
-    )
-    tested = chi_square, int(np.sum(shown)), gain
-    return _evidence(solution, family, values, tested, free)
-
-
-def _evidence(
-    solution: Solution, family: Family, values: FloatArray, tested: tuple[float, int, float],
-    free: FloatArray,
-) -> Evidence:  # fmt: skip
-    """Return the evidence with the size of what the family does to the heights.
-
-    tested: χ², its degrees of freedom, and the gain;  free: root of the covariance (size, size)
-    """
-    effect, _ = solution.network.effect(family.name, values, free @ free.T)
-    chi_square, dof, gain = tested
     declared = family.name in solution.sizes
-    return Evidence(family, values, chi_square, dof, effect, gain, free, declared)
+    if declared:
+        unit = np.broadcast_to(np.maximum(solution.sizes[family.name], 1e-15), family.size)
+        share, axes = np.linalg.eigh(solution.covariance_of(here) / np.outer(unit, unit))
+        share = np.clip(share, 1e-300, 1.0)
+        # By the data alone: the prior is taken out again.
+        taken = 1 - share
+        known, least = np.maximum(taken, 0.0) / share, _LEAST_TAKEN
+        alone = axes.T @ (solution.values[here] / unit) / np.maximum(taken, _LEAST_TAKEN)
+        plausible = wide = np.sqrt(axes.T**2 @ np.maximum(family.wide / unit, 1.0) ** 2)
+    else:
+        mixed = solution.matrix[here]
+        own = mixed[:, here]
+        score = solution.right[here] - mixed @ solution.values
+        explained = solution.factor.forward(mixed[:, solution.active].T)
+        unit = 1 / np.sqrt(np.maximum(np.diag(own), 1e-300))
+        known, axes = np.linalg.eigh((own - explained.T @ explained) * np.outer(unit, unit))
+        known, least = np.maximum(known, 0.0), _LEAST_LEFT
+        alone = axes.T @ (score * unit) / np.maximum(known, _LEAST_LEFT)
+        wide = np.full(family.size, max(family.wide / float(np.max(unit)), _NO_COLUMN))
+        plausible = np.full(family.size, family.wide * np.median(1 / unit))
+    # A direction is tested if the scans know it better than its plausible size, however small the
+    # declared one is; one that is not keeps the plausible size.
+    shown = known > np.maximum(least, wide**-2)
+    square, variance = alone[shown] ** 2, 1 / known[shown]
+    before, after = variance + float(declared), variance + plausible[shown] ** 2
+    chi_square = float(np.sum(square / before))
+    gain = chi_square - float(np.sum(square / after - np.log(before / after)))
+    values = unit * (axes @ np.where(shown, alone, 0.0))
+    free = unit[:, np.newaxis] * axes / np.sqrt(known + wide**-2)
+    effect, _ = solution.network.effect(family.name, values, free @ free.T)
+    return Evidence(family, values, chi_square, int(np.sum(shown)), effect, gain, free, declared)

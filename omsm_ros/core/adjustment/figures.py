@@ -218,13 +218,12 @@ def largest_contribution(
     errors, parameters = made.errors()
     changes = made.open_changes(doubts, alike)
     errors = made.with_changes(made.free(errors), changes)
-    resembled = {name: k - len(alike) for k, (name, _) in enumerate(alike)}
 
     def own(family: Family) -> FloatArray:
         found = effects[family.name].shape / family.wide @ parameters[_part(solution, family)]
-        if family.name in resembled:
-            k = resembled[family.name]
-            found += np.outer(changes[:, k], _chances(changes.shape[1])[k])
+        for k, (name, _) in enumerate(alike, changes.shape[1] - len(alike)):
+            if name == family.name:
+                found += np.outer(changes[:, k], _chances(changes.shape[1])[k])
         return np.asarray(found)
 
     def excess(factor: float, share: FloatArray) -> float:

@@ -289,9 +289,8 @@ def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Sol
             sizes[one.family.name] = np.minimum(size, one.family.wide)
     doubted = [e for e in named if e.declared and e.shown]
     for one, probable in zip(doubted, probabilities([e.gain for e in doubted]), strict=True):
-        if probable:
-            name = one.family.name
-            sizes[name] = np.hypot(sizes[name], np.sqrt(probable) * one.values)
+        name = one.family.name
+        sizes[name] = np.hypot(sizes[name], np.sqrt(probable) * one.values)
     for refutation in refutations:
         for other in refutation.rivals:
             share = explained(other, refutation.evidence)
