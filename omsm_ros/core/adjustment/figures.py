@@ -19,7 +19,7 @@ from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.network import Solution, solve
 from omsm_ros.core.adjustment.part_terms import FREE_M, FormTerms
 from omsm_ros.core.adjustment.refutation import Doubt, probabilities
-from omsm_ros.core.adjustment.sources import FREE, Family, base_name
+from omsm_ros.core.adjustment.sources import FREE, Contribution, Family, base_name
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
@@ -183,22 +183,6 @@ def effects_on_form(made: FormOf) -> dict[str, Effect]:
         known = family.wide**2 * np.linalg.pinv(root @ root.T, rcond=1e-10) - np.eye(family.size)
         found[family.name] = Effect(left, max(left, free), family.wide * change, known)
     return found
-
-
-@dataclass(frozen=True)
-class Contribution:
-    """The source that contributes most to the uncertainty of PV.
-
-    name, unit: of the source;  size: its standard uncertainty before the scans [unit]
-    allowed: with which U is the accuracy, all else the same [unit]; NaN: U is larger without it
-    rest: expanded uncertainty (k = 2) without the source [m]
-    """
-
-    name: str
-    unit: str
-    size: float
-    allowed: float
-    rest: float
 
 
 def largest_contribution(

@@ -74,6 +74,22 @@ class Family:
     smooth: FloatArray | None = None
 
 
+@dataclass(frozen=True)
+class Contribution:
+    """The source that contributes most to the uncertainty of PV.
+
+    name, unit: of the source;  size: its standard uncertainty before the scans [unit]
+    allowed: with which U is the accuracy, all else the same [unit]; NaN: U is larger without it
+    rest: expanded uncertainty (k = 2) without the source [m]
+    """
+
+    name: str
+    unit: str
+    size: float
+    allowed: float
+    rest: float
+
+
 def base_name(family: str) -> str:
     """Return the name of the declared source of ``family``, without the scan's number.
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from omsm_ros.core.adjustment.agreement import ScanAgreement
-from omsm_ros.core.adjustment.figures import NO_EFFECT, Contribution, Effect
+from omsm_ros.core.adjustment.figures import NO_EFFECT, Effect
 from omsm_ros.core.adjustment.refutation import Refutation
 from omsm_ros.core.adjustment.scan_data import ScanData
-from omsm_ros.core.adjustment.sources import VIBRATION, Family, Source, base_name
+from omsm_ros.core.adjustment.sources import VIBRATION, Contribution, Family, Source, base_name
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import REJECTED
 
