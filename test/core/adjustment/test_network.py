@@ -237,6 +237,23 @@ def test_nodes_lie_where_the_part_was_scanned(within):
     assert beyond > -0.5 * part.disc.radius / part.rings
 
 
+def test_low_harmonics_of_the_form_reach_waves_of_two_millimetres_by_variances_of_their_own(small):
+    """With 60 turns, to degree 40; what no family acts on is left to the cells."""
+    blocks = small[1].blocks
+    part = part_model(blocks, 60.0)
+    fine = [t for t in part.terms if t.n > 24]
+    assert max(t.n for t in fine) == 40
+    assert {abs(t.m) for t in fine} == {1, 2, 3, 4}
+    assert max(abs(t.m) for t in part.terms) == 12
+    low, other = (
+        {d for t, d in zip(part.terms, part.degrees, strict=False) if t.n > 6 and chosen(abs(t.m))}
+        for chosen in (lambda m: 0 < m <= 4, lambda m: m > 4)
+    )
+    assert low.isdisjoint(other)
+    # Few turns resolve no such waves, and their cells no high harmonics.
+    assert max(abs(t.m) for t in part_model(blocks, 12.0).terms) == 24
+
+
 def test_of_many_declarations_the_one_that_looks_wrong_by_chance_is_hardly_more_probable():
     """Odds of 12 : 1 for one of two and of forty, and two declarations that are one as another."""
     odds = 2 * np.log(12)
