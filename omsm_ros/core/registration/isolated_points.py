@@ -175,10 +175,11 @@ class FarPoints:
                 np.where(np.isfinite(away[:, 1:]), np.append(size, 0.0)[near[:, 1:]], 0.0)
                 * np.sign(rows[3, part])[:, np.newaxis]
             )
-            # The second largest, because two grains may lie side by side where points are dense.
-            full = np.isfinite(away[:, -1])
+            full, some = (np.isfinite(away[:, k]) for k in (_AROUND, _AROUND // 4))
             ranked = np.sort(same, axis=1)
-            level = np.where(full, ranked[:, -_AROUND // 4], _SIMILAR / _DENSE * ranked[:, -1])
+            # The second largest, because two grains may lie side by side where points are dense.
+            largest = np.where(some, ranked[:, -2], ranked[:, -1])
+            level = np.where(full, ranked[:, -_AROUND // 4], _SIMILAR / _DENSE * largest)
             height = np.abs(rows[3, part])
             alone = (height - level > self.limit) & (height > _DENSE * level)
             steep[part] = np.where(alone, height - level, 0.0)

@@ -161,3 +161,16 @@ def test_two_grains_of_one_size_are_no_scratch():
     made[grains] = np.geomspace(60e-9, 9e-6, len(grains))
     made[grains[15] + 360] = 1.02 * made[grains[15]]
     assert set(np.flatnonzero(made)) == set(sparse(lambda x, y: made).dust)
+
+
+def test_two_grains_side_by_side_on_a_rolled_edge_are_dust():
+    """The edge shows on the outer turn only, whose points lie far closer than the tracks."""
+    share = np.sqrt(np.linspace(1, 0, 40_000))
+    x, y = (R * share * f(160 * np.pi * share) for f in (np.cos, np.sin))
+    rolled = 150e-9 * np.clip((share - 0.98) / 0.02, 0, None)
+    grains = np.append(np.arange(1500, 40_000, 150), [400, 402])
+    height = rolled + np.random.default_rng(1).normal(0, 4e-9, len(x))
+    height[grains] += np.append(np.geomspace(200e-9, 9e-6, len(grains) - 2), [700e-9, 1200e-9])
+    batch = PointBatch(x, y, height, np.empty((0, len(x))))
+    found = register(Flat(), lambda: [batch], ("piston", "tip", "tilt"))
+    assert set(found.dust) == set(grains)
