@@ -11,6 +11,7 @@ from plain_world import MIRROR
 from soaked import soaked
 
 from omsm_ros.core.adjustment import CONTRADICTED, VERIFIED, Source, adjust
+from omsm_ros.core.adjustment.verdict import TOO_UNCERTAIN
 
 # Kind, family, its true values (or None where a drawn error adds to it).
 ONE_SCAN = [
@@ -23,7 +24,6 @@ ONE_SCAN = [
         ("spindle_6", "spindle_axial/6", [20e-9, 0.0]),
         ("spindle_2.5", "spindle_axial/2.5", [20e-9, 0.0]),
         ("height_step", "height_step@0", [90e-9]),
-        ("c_lost", "c_lost@0", [5e-4]),
     ),
 ]
 # A second scan corrects what one refutes: one kind always, the others in `make soak`.
@@ -31,6 +31,7 @@ TWO_SCANS = [
     ("creep", "creep", [3e-4, 0.0]),
     *soaked(
         *(getattr(kind, "values", kind) for kind in ONE_SCAN),
+        ("c_lost", "c_lost@0", [5e-4]),
         ("latency", "lag_change", None),
         ("lag_by_z", "lag_motion", None),
         ("lag_by_x", "lag_x", None),
@@ -41,7 +42,7 @@ TWO_SCANS = [
 # like the coma, a slow drift like a creep, which changes the scale of Z, a latency like a lag of Z
 # alone, between which the form is turned.
 IN_PART_FORM_M = {
-    "lag_by_z": 22e-9, "lag_by_x": 21e-9, "latency": 12e-9, "creep": 15e-9, "c_lost": 35e-9,
+    "lag_by_z": 24e-9, "lag_by_x": 22e-9, "latency": 12e-9, "creep": 15e-9, "c_lost": 35e-9,
     "warming": 24e-9,
 }  # fmt: skip
 
@@ -162,9 +163,7 @@ def test_candidates_that_look_alike_are_all_named():
     assert "spindle_tilt/2" in found.refutations[0].alike
 
 
-@pytest.mark.parametrize(
-    ("kind", "scans"), [("hum", 1), *soaked(("floor", 1), ("floor", 2), ("hum", 2))]
-)
+@pytest.mark.parametrize(("kind", "scans"), [("hum", 1), *soaked(("floor", 2), ("hum", 2))])
 def test_lines_in_time_are_named_by_their_frequency(kind, scans):
     machine, found = disturbed(kind, scans)
     names = {r.name.split("@")[0] for r in found.refutations}
@@ -176,6 +175,20 @@ def test_lines_in_time_are_named_by_their_frequency(kind, scans):
         assert float(value) == pytest.approx(frequency, abs=0.01)
     *_, error = normalised(machine, found)
     assert error < 2 * found.form.mean_uncertainty
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(("kind", "code"), [("c_lost", CONTRADICTED), ("floor", TOO_UNCERTAIN)])
+def test_what_passes_in_part_for_form_in_one_scan_is_in_its_uncertainty(kind, code):
+    """Low harmonics of high degree follow a step in C and a line four and a quarter times a turn.
+
+    A second scan names both.
+    """
+    machine, found = disturbed(kind, 1)
+    *_, terms, error = normalised(machine, found)
+    assert found.verdict.code == code
+    assert error < 2 * found.form.mean_uncertainty
+    assert np.max(np.abs(terms)) < 3
 
 
 @pytest.mark.parametrize("scans", [pytest.param(1, marks=pytest.mark.soak), 2])
