@@ -72,12 +72,17 @@ def latency(e: IdentificationEvidence) -> Findings:
     """
     lag, period = e.dynamics.low_frequency_delay, e.prepared.problem.period
     uncertainty = low_frequency_delay_uncertainty(e.dynamics, e.known.covariance)
-    if lag <= -max(_SIGNIFICANT * uncertainty, e.use.harmless_delay_s):
+    # A search that was cut short leaves a share of the rate in the residual.
+    rate = np.gradient(e.prepared.problem.motion, period)[e.prepared.problem.used]
+    residual, size = e.fit.residual, float(np.linalg.norm(rate))
+    lead = float(residual @ rate) / (e.fit.gain * size**2) - lag
+    uncertainty = max(uncertainty, float(np.std(residual)) / (abs(e.fit.gain) * size))
+    if lead >= max(_SIGNIFICANT * uncertainty, e.use.harmless_delay_s):
         noise = {"encoder_noise_m": e.prepared.steps.noise, "probe_noise_m": e.residual.noise}
         if noise["encoder_noise_m"] > noise["probe_noise_m"]:
-            yield Finding("identification.exchanged_channels", REJECTS, {"lead_s": -lag} | noise)
+            yield Finding("identification.exchanged_channels", REJECTS, {"lead_s": lead} | noise)
         else:
-            yield Finding("identification.late_encoder", RESERVATION, {"lead_s": -lag})
+            yield Finding("identification.late_encoder", RESERVATION, {"lead_s": lead})
     limit = max(_LONGEST_LAG_S, _LONGEST_LAG_SAMPLES * period)
     if lag >= limit:
         values = {"lag_s": lag, "samples": lag / period}
