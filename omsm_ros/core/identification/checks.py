@@ -72,11 +72,8 @@ def latency(e: IdentificationEvidence) -> Findings:
     """
     lag, period = e.dynamics.low_frequency_delay, e.prepared.problem.period
     uncertainty = low_frequency_delay_uncertainty(e.dynamics, e.known.covariance)
-    # A search that was cut short leaves a share of the rate in the residual.
-    rate = np.gradient(e.prepared.problem.motion, period)[e.prepared.problem.used]
-    residual, size = e.fit.residual, float(np.linalg.norm(rate))
-    lead = float(residual @ rate) / (e.fit.gain * size**2) - lag
-    uncertainty = max(uncertainty, float(np.std(residual)) / (abs(e.fit.gain) * size))
+    left, by_noise = e.lag_in_residual
+    lead, uncertainty = -lag - left, max(uncertainty, by_noise)
     if lead >= max(_SIGNIFICANT * uncertainty, e.use.harmless_delay_s):
         noise = {"encoder_noise_m": e.prepared.steps.noise, "probe_noise_m": e.residual.noise}
         if noise["encoder_noise_m"] > noise["probe_noise_m"]:

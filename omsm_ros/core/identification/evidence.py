@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import numpy as np
+
 from omsm_ros.core.calibration.certificate import Undetected
 from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse
 from omsm_ros.core.estimation.output_error import Fit
@@ -59,6 +61,14 @@ class IdentificationEvidence:
     def residual(self) -> ResidualTests:
         """Tests of the residual."""
         return residual_tests(self.prepared.problem, self.fit, self.prepared.steps)
+
+    @cached_property
+    def lag_in_residual(self) -> tuple[float, float]:
+        """Lag that a search left in the residual where it was cut short, and its noise [s]."""
+        problem, residual = self.prepared.problem, self.fit.residual
+        rate = self.fit.gain * np.gradient(problem.motion, problem.period)[problem.used]
+        power = float(rate @ rate)
+        return -float(residual @ rate) / power, float(np.std(residual) / np.sqrt(power))
 
     @cached_property
     def response_difference(self) -> float | None:

@@ -75,6 +75,7 @@ def evidence(
         ),
         fit=SimpleNamespace(gain=gain, uncertain=uncertain, structure=SimpleNamespace(poles=2)),
         dynamics=dynamics,
+        lag_in_residual=(0.0, 0.0),
         limits=LIMITS,
         use=use,
         reached=reached,
