@@ -21,7 +21,7 @@ def write(path, recording):
 
 
 def facts(capsys, *arguments):
-    """Run a command; return its JSON. What it found is also printed as text for people."""
+    """Run a command; return its JSON. The findings are printed as text for people, too."""
     with mock.patch.object(command_line, "_tell", wraps=command_line._tell) as tell:
         assert cli.main([*map(str, arguments), "--json"]) == 0
     machine = json.loads(capsys.readouterr().out)

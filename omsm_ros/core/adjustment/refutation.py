@@ -38,7 +38,7 @@ _MOST_TRIED = 3
 # Before the scans: of ten errors that nobody declared, a machine has one; of ten adjustments, one
 # has a declaration that is wrong.
 ODDS_ABSENT, SURE = 9.0, 50.0
-# What is less probable lies outside an interval of 95 %.
+# A smaller probability lies outside an interval of 95 %.
 _LEAST_LIKELY = 0.05
 # No model excludes more; with a smaller prior, what the scans know of a family would be rounding.
 _LEAST_PROBABLE = 1e-6

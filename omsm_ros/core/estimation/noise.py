@@ -110,7 +110,7 @@ def timing_variance(on_grid: FloatArray, rate: FloatArray, *, noisy: bool = Fals
     known = np.isfinite(second)
     second, weight = second[known], weight[known]
     still = weight < _STILL * np.max(weight, initial=0.0)
-    # What persists from sample to sample in motion is no scatter in time.
+    # A residual that persists from sample to sample in motion is no scatter in time.
     moving = (square > _STILL * np.max(square)) & np.isfinite(on_grid)
     product = np.where(moving, on_grid, 0.0)
     product = product[1:] * product[:-1]

@@ -276,7 +276,7 @@ class Problem:
     def by_lines(self, scaled: ScaledStructure) -> Project:
         """Return a projection as :meth:`project` whose products are sums over lines of spectra.
 
-        What is not compared is filled in with the last model a step started from (expectation
+        Samples not compared are filled in with the last model a step started from (expectation
         maximisation, Dempster et al. 1977): the sum of squares is exact, the linear parameters are
         the best ones once the descent has come to rest. The first model is the static gain.
         """

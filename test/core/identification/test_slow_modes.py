@@ -90,7 +90,7 @@ def test_a_slow_line_of_vibration_is_no_mode():
 
 
 def test_a_light_mode_that_rings_through_every_rest_is_no_friction():
-    """Of 12 Hz and 0.5 %: two poles and friction do not describe it better than its own three."""
+    """At 12 Hz and 0.5 %, two poles and friction describe it no better than its own three."""
     edges, rng, omega = np.random.default_rng(127), np.random.default_rng(50), 2 * np.pi * 12
     starts = 0.4 + 0.52 * np.arange(20) + edges.uniform(0, PERIOD, 20)
     finer = 2.5e-5

@@ -20,7 +20,7 @@ SLOPES, SIZES, PLACES = (3e-3, -1e-3), (40.0, 15.0), (20, 5)
 
 
 class UnknownError(Exception):
-    """Of a format that no reader knows."""
+    """No reader knows the format."""
 
 
 @pytest.fixture
