@@ -47,9 +47,11 @@ NOT_RUN |= {} if REAL_ROS2 else NEEDS_LAUNCH | NEEDS_ACTIONS
 
 # Commands that a page assumes to have been run before.
 CELL = "ros2 launch omsm_ros cell.launch.py params:=my_cell/"
+CALIBRATOR = "ros2 run omsm_ros calibrator --ros-args -r __ns:=/omsm"
 CHROCODILE = "ros2 launch omsm_ros cell.launch.py emulated:=true device:=chrocodile"
 BEFORE = {
-    "ros2 service call /omsm/calibrator/identify": "ros2 play step_test",
+    "ros2 service call /omsm/calibrator/identify ": "ros2 play step_test",
+    "ros2 service call /omsm/calibrator/identify/_action": CALIBRATOR,
     "ros2 service call /omsm/confocal_driver": CHROCODILE,
     "ros2 lifecycle": CELL,
     "omsm history --machine": "export OMSM_CATALOGUE=shop.sqlite; "
