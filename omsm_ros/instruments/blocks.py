@@ -43,16 +43,14 @@ class BlockSettings:
 
     sample_period: nominal [s];  block_size: samples
     pause: silence after which a partial block is handed over [s]
-    renew: silence after which the connection is made again, which may cost two samples [s];
-        0 = never
-    free_running: the device keeps the period itself, so a block at another rate is withheld
+    renew: longest time between two connections to a silent TCP stream, and silence after which
+        a refused one is an error [s]; 0 = never
     """
 
     sample_period: float = 1e-3
     block_size: int = 100
     pause: float = 0.2
     renew: float = 0.0
-    free_running: bool = False
 
 
 class Channels(NamedTuple):
@@ -95,9 +93,12 @@ class BlockCutter:
     period_warnings: full blocks beyond PERIOD_TOLERANCE
     """
 
-    def __init__(self, settings: BlockSettings, channels: Channels) -> None:
-        self._settings = settings
-        self._channels = channels
+    def __init__(
+        self, settings: BlockSettings, channels: Channels, free_running: bool = False
+    ) -> None:
+        """free_running: the device keeps the period itself, so another rate is withheld."""
+        self._settings, self._channels = settings, channels
+        self._free_running = free_running
         self._clock = DeviceClock()
         self._pending: Samples = np.empty(0, SAMPLE)
         self._first = self._stamp = 0
@@ -105,7 +106,7 @@ class BlockCutter:
         # Without a clock of the device, only arrivals show a trigger that it missed. Channels that
         # one device latches stay together.
         together = channels.distance and channels.axes is not None
-        watched = not (channels.timed or settings.free_running or together)
+        watched = not (channels.timed or free_running or together)
         period, pause = settings.sample_period, settings.pause
         self.detector = MissedTriggerDetector(period, pause) if watched else None
         # Arrival, the same by the clock of the stamps, whether after a silence.
@@ -135,7 +136,7 @@ class BlockCutter:
         ``arrives_otherwise``.
         """
         if not self._channels.timed:
-            return self._settings.free_running and self.arrives_otherwise
+            return self._free_running and self.arrives_otherwise
         return self._evenly_wrong
 
     @property
@@ -238,7 +239,7 @@ class BlockCutter:
         after_silence: bool,
     ) -> None:
         """Enter the arrival of the last sample before a restart of the device."""
-        may_pause = not (self._channels.timed or self._settings.free_running or self.detector)
+        may_pause = not (self._channels.timed or self._free_running or self.detector)
         if runs[0].restarted or (after_silence and may_pause):
             self._clock.restart()
         anew = (i for i, run in enumerate(runs) if i and run.restarted)
@@ -311,7 +312,7 @@ class BlockCutter:
         edges = np.unique(np.linspace(0, periods, _PARTS + 1).astype(int))
         parts = np.diff(samples["time"][edges]) * NANOSECOND_S
         off = parts / np.maximum(np.diff(edges) * self._settings.sample_period, NANOSECOND_S) - 1
-        limit = RATE_TOLERANCE if self._settings.free_running else TRIGGER_TOLERANCE
+        limit = RATE_TOLERANCE if self._free_running else TRIGGER_TOLERANCE
         self._evenly_wrong = bool(off.min() > limit or off.max() < -limit)
 
     def _blocks(self, samples: Samples, first: int, stamp: int) -> BlockPair:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from copy import copy
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -40,6 +41,12 @@ class TracedTransport:
     def baud_rate(self) -> int | None:
         """Return the baud rate of the transport that is traced; None if it has none."""
         return getattr(self._transport, "baud_rate", None)
+
+    def spare(self) -> Any:
+        """Return another connection of the transport that is traced, in the same trace."""
+        other = copy(self)
+        other._transport, other._file = self._transport.spare(), None  # type: ignore[attr-defined]
+        return other
 
     def open(self) -> None:
         """Connect; raises DeviceError, or ConfigurationError if the trace cannot be written."""

@@ -68,7 +68,7 @@ DEVICE = Parameter(
 RENEW = Parameter(
     "renew",
     10.0,
-    "silence after which a stream over TCP is connected again [s]; 0 = never",
+    "longest time between two connections to a silent TCP stream [s]; 0 = never",
     quantities.SILENCE,
 )
 _STREAM_PARAMETERS = (

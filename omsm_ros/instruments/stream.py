@@ -7,6 +7,7 @@ never came are ``lost``; bytes that hold none are counted by the decoder of the 
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -22,6 +23,9 @@ from omsm_ros.units import NANOSECONDS_PER_S
 UNREADABLE_S = 2.0
 # A counter of so few counts misses losses that are likely enough to be stated.
 _SMALL_COUNTER = 16
+# A silent stream is connected once more after this [s] or so many of its periods, then each time
+# that the silence is longer by this part: a device that returns is heard soon.
+_RENEW_S, _RENEW_PERIODS, _RENEW_PART = 1.0, 5, 0.1
 # Time between two checks of the time-out of an answer [s].
 _ANSWER_S = 0.05
 
@@ -91,16 +95,17 @@ class StreamDevice:
         self._decoder: Any = None  # of the protocol, with ``statistics`` and ``reset``
         self._unread = 0  # bytes that came since the last sample, an idle line's left out
         self._transport = transport
+        self._spare: Any = None  # a second connection of a silent stream
         self._settings = settings
         self._now_ns = now_ns
         self._monotonic = monotonic
         self._tracker = SequenceTracker(counting)
         self._small_counter = counting.modulus if counting.modulus <= _SMALL_COUNTER else 0
-        self._cutter = BlockCutter(settings, channels)
+        self._cutter = BlockCutter(settings, channels, counting.period > 0)
         self._identity: dict[str, str] = {}
         self.decoded = 0
         self._counting_lock = threading.RLock()  # held while samples pass from one count to another
-        self._heard = self._opened = monotonic()
+        self._heard = self._opened = self._renewed = monotonic()
         self._came_ns, self._came_at = 0, self._heard  # of the last bytes
         self._down = False
         self.renewals = 0
@@ -120,7 +125,7 @@ class StreamDevice:
         hands over the partial block.
         """
         try:
-            data = self._transport.read(timeout)
+            data = self._receive(timeout)
         except DeviceError:
             self._cutter.lost_settings = self.decoded > 0  # it may have been switched off
             raise
@@ -146,11 +151,44 @@ class StreamDevice:
             blocks += self._cutter.end()
         silent = now - max(self._heard, self._opened)
         self._listen_in(silent)
-        if 0 < self._settings.renew < silent:
-            # A device that waits for its trigger accepts it; one that is gone refuses it.
-            self.open()
-            self.renewals += 1
+        if self._settings.renew:
+            self._renew(now, silent)
         return blocks
+
+    def _receive(self, timeout: float) -> bytes:
+        """Return what arrives; of a silent connection and a spare one, the first is kept."""
+        data, spare = self._transport.read(timeout), self._spare
+        if spare and not data:
+            with suppress(DeviceError):
+                data = spare.read(0.0)
+            if data:
+                self._transport, spare = spare, self._transport
+                self._prepare()
+                self._down = True
+        if spare and data:
+            spare.close()
+            self._spare = None
+        return data
+
+    def _renew(self, now: float, silent: float) -> None:
+        """Connect once more to a stream that rests, or whose device forgot it; raises DeviceError.
+
+        The silent connection is kept, so that a device that waits for its trigger loses nothing.
+        """
+        least = max(_RENEW_S, _RENEW_PERIODS * self._settings.sample_period)
+        pause = min(max(least, _RENEW_PART * silent), self._settings.renew)
+        if now - max(self._renewed, self._heard, self._opened) < pause:
+            return
+        self._renewed = now
+        if self._spare:
+            self._spare.close()
+        self._spare = self._transport.spare()  # type: ignore[attr-defined]  # only TCP renews
+        try:
+            self._spare.open()
+            self.renewals += 1
+        except DeviceError:
+            if silent > self._settings.renew:
+                raise
 
     def close(self) -> list[BlockPair]:
         """Disconnect and hand over the partial block, if any."""
@@ -158,6 +196,8 @@ class StreamDevice:
         blocks = [*self._end(self._now_ns()), *self._cutter.end()]
         self._cutter.withhold()
         self._cutter.lost_settings = off  # what waited was measured before
+        if self._spare:
+            self._spare.close()
         self._transport.close()
         return blocks
 

@@ -36,14 +36,16 @@ DEFAULT_BAUD_RATE = 921_600
 _CHUNK_BYTES = 16_384
 ADS_SCHEME, PANDA_SCHEME = "ads://", "panda://"
 _TCP_SCHEME = "tcp://"
-# Keep-alive: the first probe after 5 s, then each 2 s; the connection is lost after 3 without
-# answer, or if sent data is not acknowledged within 10 s.
+# Keep-alive: a probe each second, which a device that was switched off refuses when it is back; the
+# connection is lost after 10 without answer, or if sent data is not acknowledged within 10 s.
 _KEEP_ALIVE = {
-    socket.TCP_KEEPIDLE: 5,
-    socket.TCP_KEEPINTVL: 2,
-    socket.TCP_KEEPCNT: 3,
+    socket.TCP_KEEPIDLE: 1,
+    socket.TCP_KEEPINTVL: 1,
+    socket.TCP_KEEPCNT: 10,
     socket.TCP_USER_TIMEOUT: 10_000,
 }
+# Time to connect once more, while the silent connection is not read [s].
+_SPARE_S = 0.5
 _SERIAL_SCHEME = "serial://"
 
 
@@ -184,6 +186,10 @@ class TcpTransport:
         self._address = (host, port)
         self._connect_timeout = connect_timeout
         self._socket: socket.socket | None = None
+
+    def spare(self) -> TcpTransport:
+        """Return another connection to the same address, not yet open."""
+        return TcpTransport(*self._address, _SPARE_S)
 
     def open(self) -> None:
         self.close()

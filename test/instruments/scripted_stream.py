@@ -29,6 +29,9 @@ class Script:
     def close(self) -> None:
         self.closed += 1
 
+    def spare(self) -> Script:
+        return Script()
+
     def read(self, timeout: float) -> bytes:
         portion = self.portions.pop(0) if self.portions else b""
         if isinstance(portion, Exception):

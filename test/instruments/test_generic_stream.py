@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -20,6 +22,7 @@ from omsm_ros.instruments.counting import Counting, SequenceTracker
 from omsm_ros.instruments.scaling import AxisScaling
 from omsm_ros.instruments.six_channel.device import GenericStreamDevice, StreamSettings, samples_of
 from omsm_ros.instruments.six_channel.protocol import ProbeScaling, StreamScaling, encode_frames
+from omsm_ros.instruments.transport import TcpTransport
 
 from .scripted_stream import AT_ONCE, NEVER, Script, frames_of, run, spans
 
@@ -215,10 +218,11 @@ def polled(script: Script, renew: float, seconds: float) -> GenericStreamDevice:
 
 
 def test_a_silent_stream_is_connected_anew_again_and_again() -> None:
-    script = Script()
-    device = polled(script, renew=10.0, seconds=35.0)
-    assert device.statistics.renewals == 3
-    assert script.opened == 4
+    """Each second at first, then after a tenth of the silence, at most ``renew``."""
+    assert polled(Script(), renew=10.0, seconds=10.0).statistics.renewals == 10
+    late = polled(Script(), renew=10.0, seconds=100.0).statistics.renewals
+    assert polled(Script(), renew=10.0, seconds=200.0).statistics.renewals == late + 10
+    assert polled(Script(), renew=0.5, seconds=10.0).statistics.renewals == 20
 
 
 def test_one_that_speaks_or_may_rest_is_left_alone() -> None:
@@ -227,24 +231,85 @@ def test_one_that_speaks_or_may_rest_is_left_alone() -> None:
     assert polled(Script(), renew=0.0, seconds=35.0).statistics.renewals == 0
 
 
-def test_what_comes_on_the_new_connection_goes_on_in_the_count() -> None:
-    """The counter tells what the silence cost."""
-    first, then = (encode_frames(frames_of(list(range(a, a + 10)))) for a in (0, 15))
-    script = Script(first, *[b""] * 30, then)
-    device = polled(script, renew=10.0, seconds=16.0)
-    assert device.statistics.renewals == 1
-    assert (device.statistics.decoded, device.statistics.lost) == (20, 5)
+class Silent:
+    """A stream over a real connection that was served, and has been silent for a second."""
+
+    def __init__(self, server: socket.socket, ends: contextlib.ExitStack) -> None:
+        self.server, self.ends, self.clock = server, ends, Moments()
+        host, port = server.getsockname()
+        self.device = GenericStreamDevice(
+            TcpTransport(host, port), StreamSettings(renew=10.0), time.time_ns, self.clock
+        )
+        self.device.open()
+        self.first = ends.enter_context(server.accept()[0])
+        self.first.sendall(encode_frames(frames_of(list(range(10)))) + b"half a frame")
+        self.read(10)
+        self.spare = self.silent()
+
+    def silent(self) -> socket.socket:
+        """The connection that the device makes after one more second of silence."""
+        self.clock.now += 1.01
+        self.device.poll(0.01)
+        return self.ends.enter_context(self.server.accept()[0])
+
+    def read(self, samples: int) -> None:
+        given_up = time.monotonic() + 20
+        while self.device.decoded < samples and time.monotonic() < given_up:
+            self.clock.now += 0.001
+            self.device.poll(0.05)
+        assert self.device.decoded == samples
+
+
+@pytest.fixture
+def silent() -> Iterator[Silent]:
+    with socket.create_server(("127.0.0.1", 0)) as server, contextlib.ExitStack() as ends:
+        server.settimeout(20.0)
+        found = Silent(server, ends)
+        yield found
+        found.device.close()
+
+
+def test_a_device_that_forgot_its_connection_is_heard_a_second_after_its_return(
+    silent: Silent,
+) -> None:
+    """Nobody serves the connections of the fault; the counter tells what the silence cost."""
+    served = silent.silent()
+    served.sendall(encode_frames(frames_of(list(range(15, 25)))))
+    silent.read(20)
+    found = silent.device.statistics
+    assert (found.renewals, found.lost, found.duplicates) == (2, 5, 0)
+    assert [end.recv(1) for end in (silent.first, silent.spare)] == [b"", b""]
+
+
+def test_a_device_that_waited_for_its_trigger_loses_nothing(silent: Silent) -> None:
+    """It serves one connection only, and never saw the others that were made meanwhile."""
+    for _ in range(5):
+        silent.silent()
+    silent.first.sendall(b"\0" + encode_frames(frames_of(list(range(10, 30)))))
+    silent.read(30)
+    assert silent.device.statistics.lost == 0
+    assert silent.spare.recv(1) == b""
+
+
+def test_a_spare_connection_that_is_closed_is_left(silent: Silent) -> None:
+    silent.spare.close()
+    silent.device.poll(0.01)
+    silent.first.sendall(b"\0" + encode_frames(frames_of(list(range(10, 30)))))
+    silent.read(30)
 
 
 def test_one_that_is_gone_is_an_error() -> None:
     class Gone(Script):
         def open(self) -> None:
-            super().open()
-            if self.opened > 1:
-                raise DeviceError("no route to host")
+            raise DeviceError("no route to host")
 
+    class Lost(Script):
+        def spare(self) -> Script:
+            return Gone()
+
+    assert polled(Lost(), renew=10.0, seconds=9.5).statistics.renewals == 0
     with pytest.raises(DeviceError, match="no route"):
-        polled(Gone(), renew=10.0, seconds=35.0)
+        polled(Lost(), renew=10.0, seconds=12.0)
 
 
 def test_counts_agree_at_every_moment() -> None:

@@ -66,7 +66,7 @@ def test_a_flipped_bit_in_the_header_of_a_block_makes_no_wrong_sample() -> None:
         script[5][bit // 8] ^= 1 << bit % 8
         driver = CapaNcdtDevice(
             Script(*map(bytes, script)),
-            CapaNcdtSettings(probe=ProbeReading(full_scale=1e-4), triggered=True),
+            CapaNcdtSettings(probe=ProbeReading(full_scale=1e-4), trigger="each"),
         )
         driver.open()
         found = []

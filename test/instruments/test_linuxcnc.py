@@ -1,5 +1,9 @@
 """Lines of HAL's sampler: resolution, restarts and overruns."""
 
+import socket
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -93,3 +97,54 @@ def test_another_period_than_linuxcnc_states_is_not_delivered():
     )
     assert not blocks
     assert counts["withheld"] == 500
+
+
+HAL = """
+import pathlib
+
+sampler_base = 0
+
+class component:
+    def __init__(self, name): pass
+    def ready(self): pass
+
+class stream:
+    num_overruns = numbers = 0
+    def __init__(self, *_): pass
+    @property
+    def readable(self): return pathlib.Path("sampling").exists() and self.numbers < 100
+    def read(self):
+        self.numbers += 1
+        return [self.numbers]
+"""
+
+
+def test_a_client_that_left_before_the_first_sample_costs_none(tmp_path: Path) -> None:
+    """A driver connects again while the machine is not homed; its last connection gets all."""
+    (tmp_path / "hal.py").write_text(HAL)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = free.getsockname()
+    script = Path(__file__).parents[2] / "config" / "linuxcnc" / "send.py"
+    command = [sys.executable, script, str(address[1]), "f"]
+    with subprocess.Popen(command, cwd=tmp_path, env={"PYTHONPATH": str(tmp_path)}) as sender:
+        try:
+            for _ in range(3):
+                connected(address).close()
+            with connected(address) as last:
+                (tmp_path / "sampling").touch()
+                said = b""
+                while said.count(b"\n") < 100 and (more := last.recv(4096)):
+                    said += more
+        finally:
+            sender.kill()
+    assert [float(line) for line in said.split()] == list(range(1, 101))
+
+
+def connected(address: tuple[str, int]) -> socket.socket:
+    given_up = time.monotonic() + 20
+    while True:
+        try:
+            return socket.create_connection(address, 20)
+        except ConnectionRefusedError:
+            assert time.monotonic() < given_up
+            time.sleep(0.05)

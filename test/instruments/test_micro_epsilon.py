@@ -262,7 +262,7 @@ def test_senseless_settings_are_refused(make: Callable[[], object]) -> None:
     ("device", "wanted"),
     [
         (ConfocalDtEthernetDevice, ConfocalDtSettings(trigger="each")),
-        (CapaNcdtDevice, CapaNcdtSettings(triggered=True)),
+        (CapaNcdtDevice, CapaNcdtSettings(trigger="each")),
     ],
 )
 def test_another_service_on_the_port_is_reported_even_while_waiting_for_a_trigger(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from omsm_ros.instruments.chrocodile.emulator import ChrocodileEmulator, Chrocod
 from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
 from omsm_ros.instruments.emulator import AXIS_SCALING
 from omsm_ros.instruments.factory import TracedTransport
+from omsm_ros.instruments.transport import TcpTransport
 
 SIX = ChrocodileSettings(axes=AXIS_SCALING)
 
@@ -83,6 +85,20 @@ def test_every_connection_is_in_the_trace(tmp_path: Path) -> None:
         ("open", b""), (">", b"first"), ("close", b""),
         ("open", b""), (">", b"second"), ("close", b""),
     ]  # fmt: skip
+
+
+def test_a_spare_connection_is_in_the_same_trace(tmp_path: Path) -> None:
+    path = tmp_path / "wire.trace"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        traced = TracedTransport(TcpTransport(*server.getsockname()), path)
+        for word in (b"first", b"second"):
+            each = traced.spare() if word == b"second" else traced
+            each.open()
+            with server.accept()[0] as end:
+                end.sendall(word)
+                assert each.read(20.0) == word
+            each.close()
+    assert [event.data for event in read_trace(path) if event.sign == "<"] == [b"first", b"second"]
 
 
 @pytest.mark.parametrize("place", ["/dev/full", "/dev/null/wire.trace", "/", "wire\0trace"])

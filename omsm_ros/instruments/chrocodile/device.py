@@ -120,7 +120,7 @@ class Chrocodile(StreamDevice):
         period = settings.sample_period if free else 0.0
         super().__init__(
             transport,
-            replace(settings, free_running=free),
+            settings,
             Channels(axes=wrapping(settings.axes, ENCODER_RANGE), timed=timed),
             Counting(_COUNTER_RANGE, timed=timed, checked=False, period=period),
             *clocks,
@@ -377,11 +377,12 @@ def settings_from(values: Values) -> ChrocodileSettings:
         latch=values["latch"],
         trigger=values["trigger"],
         format=values["format"],
-        lamp=_unless_negative(values["lamp"]),
-        averaging=_unless_negative(values["averaging"]),
-        threshold=_unless_negative(values["threshold"]),
-        head=_unless_negative(values["sensor_head"]),
         probe=probe_reading_of(values),
+        **{  # a negative value keeps the device's own
+            name.removeprefix("sensor_"): values[name]
+            for name in ("lamp", "averaging", "threshold", "sensor_head")
+            if values[name] >= 0
+        },
     )
 
 
@@ -399,7 +400,3 @@ def _encoders(text: str) -> tuple[int, ...]:
             f"encoders {text!r}, expected the letters {letters} in the order of X, Y, Z, B, C"
         )
     return tuple(letters.index(letter) for letter in text.upper())
-
-
-def _unless_negative(value: Any) -> Any:
-    return None if value < 0 else value

@@ -5,16 +5,16 @@ and silent, so the driver connects again after a silence.
 """
 
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from omsm_ros.core.streams.blocks import IntArray, Status
 from omsm_ros.errors import DeviceError
-from omsm_ros.instruments.blocks import RATE_TOLERANCE, BlockSettings, Channels
+from omsm_ros.instruments.blocks import RATE_TOLERANCE, Channels
 from omsm_ros.instruments.counting import SAMPLE, Samples
-from omsm_ros.instruments.micro_epsilon.device import BlockStreamDevice
+from omsm_ros.instruments.micro_epsilon.device import BlockStreamDevice, ControllerSettings
 from omsm_ros.instruments.micro_epsilon.protocol import Frames, channel_dtype
 from omsm_ros.instruments.parameters import (
     NowNs,
@@ -33,25 +33,17 @@ FULL_SCALE = 0xFFFFFF
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CapaNcdtSettings(BlockSettings):
-    """Settings of the controller.
-
-    probe: ``full_scale`` is the channel's measuring range [m]
-    channel: of the controller, from 1
-    triggered: samples come with an external trigger, not continuously
-    patience: for an answer, and for samples of a free-running controller [s]
-    """
+class CapaNcdtSettings(ControllerSettings):
+    """Settings of the controller;  channel: from 1."""
 
     probe: ProbeReading = field(default_factory=lambda: ProbeReading(full_scale=250 * MICROMETRE_M))
     channel: int = 1
-    triggered: bool = False
-    patience: float = 2.0
 
 
 class CapaNcdtDevice(BlockStreamDevice):
     """Reads one channel, and sets the sample time if there is a command port."""
 
-    prompt = PROMPT
+    kind, prompt = "capacitive", PROMPT
 
     def __init__(
         self,
@@ -62,18 +54,7 @@ class CapaNcdtDevice(BlockStreamDevice):
     ) -> None:
         """commands: the controller's port 23; None = keep its settings."""
         settings = settings or CapaNcdtSettings()
-        free = not settings.triggered
-        super().__init__(
-            transport,
-            replace(settings, free_running=free),
-            Channels(timed=False),
-            kind="capacitive",
-            period=settings.sample_period if free else 0.0,
-            patience=settings.patience,
-            commands=commands,
-            clocks=clocks,
-        )
-        self._wanted = settings
+        super().__init__(transport, settings, Channels(timed=False), *clocks, commands=commands)
 
     def _set_up(self, port: CommandPort) -> dict[str, str]:
         """Set the sample time; the controller rounds it and reports the result."""
@@ -91,7 +72,7 @@ class CapaNcdtDevice(BlockStreamDevice):
                 f"{self._transport.name}: {wanted:.0f} µs were requested, the controller samples "
                 f"every {found[1]} µs; set sample_period to {float(found[1]) * MICROSECOND_S:.9g} s"
             )
-        port.ask(f"$TRG{int(self._wanted.triggered)}", "\r", rb"\$TRG")
+        port.ask(f"$TRG{int(not self._wanted.period)}", "\r", rb"\$TRG")
         return identity
 
     def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
@@ -120,7 +101,7 @@ def make(values: Values, now_ns: NowNs) -> CapaNcdtDevice:
         **block_settings(values),
         probe=probe_reading_of(values),
         channel=values["channel"],
-        triggered=values["triggered"],
+        trigger="each" if values["triggered"] else "free_run",
     )
     commands = command_transport(values["port"], values["command_port"])
     return CapaNcdtDevice(transport_for(values["port"]), settings, now_ns, commands=commands)

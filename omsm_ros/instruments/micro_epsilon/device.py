@@ -7,7 +7,7 @@ command port is given.
 
 import itertools
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -61,40 +61,54 @@ COUNTER_RANGE = 2**32
 _UNDESCRIBED = b"DATA"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControllerSettings(BlockSettings):
+    """Settings of all controllers.
+
+    probe: ``full_scale`` is the measuring range, of which RS-422 and capaNCDT send fractions
+    trigger: "free_run", or anything else for an external trigger
+    patience: for an answer, and for samples of a free-running controller [s]
+    """
+
+    probe: ProbeReading = field(default_factory=ProbeReading)
+    trigger: str = "free_run"
+    patience: float = 2.0
+
+    @property
+    def period(self) -> float:
+        """Return the period of a free-running controller [s]; 0 = triggered."""
+        return self.sample_period if self.trigger == "free_run" else 0.0
+
+
 class BlockStreamDevice(StreamDevice):
     """Decodes the blocks of an Ethernet controller, and sets it up if there is a command port.
 
     A model implements ``_frame`` (its fields), ``_samples_of`` (a block → samples) and ``_set_up``
-    (commands); ``prompt`` is the regular expression of the end of an answer.
+    (commands); ``kind`` is that of :class:`BlockDecoder`, ``prompt`` the regular expression of the
+    end of an answer.
     """
 
-    prompt: bytes = b""
+    kind, prompt = "", b""
 
     def __init__(
         self,
         transport: Transport,
-        settings: BlockSettings,
+        settings: ControllerSettings,
         channels: Channels,
-        *,
-        kind: str,
-        period: float,
-        patience: float,
+        *clocks: Any,
         commands: Transport | None,
-        clocks: tuple[Any, ...] = (),
     ) -> None:
-        """kind: of :class:`BlockDecoder`;  period: of a free-running controller [s], else 0
-        patience: for an answer [s];  commands: the controller's port 23; None = keep its settings
-        """
-        counting = Counting(COUNTER_RANGE, timed=False, checked=False, period=period)
+        """commands: the controller's port 23; None = keep its settings."""
+        counting = Counting(COUNTER_RANGE, timed=False, checked=False, period=settings.period)
         super().__init__(transport, settings, channels, counting, *clocks)
-        self._decoder = BlockDecoder(kind, self._frame)
-        self._head_bytes, self._frame_bytes = HEADERS[kind].size, 1
+        self._wanted: Any = settings  # of the model
+        self._decoder = BlockDecoder(self.kind, self._frame)
+        self._head_bytes, self._frame_bytes = HEADERS[self.kind].size, 1
         self._undescribed = False
         self._next: int | None = None  # counter of the next block
         self._doubtful: list[MeasurementBlock] = []  # a block whose counter is not the next one
         self._latest: tuple[int, bytes] | None = None  # counter and frames
-        self._commands, self._period, self._patience = commands, period, patience
-        self._answers = Patience(patience)
+        self._commands, self._answers = commands, Patience(settings.patience)
 
     def _prepare(self) -> None:
         super()._prepare()
@@ -171,7 +185,7 @@ class BlockStreamDevice(StreamDevice):
                 "describe their content; read this controller over RS-422 (device: confocaldt)"
             )
         super()._listen_in(silent)
-        _check_not_silent(self._transport.name, self._period, self._patience, silent)
+        _check_not_silent(self._transport.name, self._wanted, silent)
 
     def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
         """Return the fields of a frame, by the flags in the block's header."""
@@ -187,23 +201,17 @@ class BlockStreamDevice(StreamDevice):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ConfocalDtSettings(BlockSettings):
+class ConfocalDtSettings(ControllerSettings):
     """Settings of the controller.
 
-    probe: ``full_scale`` is the measuring range; RS-422 values are fractions of it
     values: SERIAL_VALUES in a frame over RS-422, in order; "-" is ignored
     axes: scaling of X, Y, Z, B, C, or None;  wired: axes on encoders 1, 2, 3 (0 = X … 4 = C);
         an axis without an encoder stays at its offset
-    trigger: "free_run", or anything else for an external trigger
-    patience: for an answer, and for samples of a free-running controller [s]
     """
 
-    probe: ProbeReading = field(default_factory=ProbeReading)
     values: tuple[str, ...] = ("distance",)
     axes: tuple[AxisScaling, ...] | None = None
     wired: tuple[int, ...] = ()
-    trigger: str = "free_run"
-    patience: float = 2.0
 
     def __post_init__(self) -> None:
         named = [value for value in self.values if value != SKIPPED_VALUES]
@@ -213,11 +221,6 @@ class ConfocalDtSettings(BlockSettings):
                 f"values {self.values!r}, expected 'distance' and more of {SERIAL_VALUES!r}, each "
                 f"once, in the order of the frame; {SKIPPED_VALUES!r} for another value"
             )
-
-    @property
-    def period(self) -> float:
-        """Return the period of a free-running controller [s]; 0 = triggered."""
-        return self.sample_period if self.trigger == "free_run" else 0.0
 
 
 class ConfocalDtDevice(StreamDevice):
@@ -236,8 +239,7 @@ class ConfocalDtDevice(StreamDevice):
         counted = "counter" in settings.values
         modulus = 2**VALUE_BITS if counted else 2**62
         counting = Counting(modulus, timed=False, checked=not counted, period=settings.period)
-        base = replace(settings, free_running=settings.period > 0)
-        super().__init__(transport, base, Channels(timed=False), counting, *clocks)
+        super().__init__(transport, settings, Channels(timed=False), counting, *clocks)
         self._wanted = settings
         self._decoder = SerialDecoder(len(settings.values))
         self._believed = PlausibleValueFilter(len(settings.values))
@@ -280,13 +282,13 @@ class ConfocalDtDevice(StreamDevice):
         if "counter" not in self._wanted.values:
             self._tracker.restart_count()
         super()._listen_in(silent)
-        _check_not_silent(self._transport.name, self._wanted.period, self._wanted.patience, silent)
+        _check_not_silent(self._transport.name, self._wanted, silent)
 
 
 class ConfocalDtEthernetDevice(BlockStreamDevice):
     """Reads blocks, and sets the measuring rate if there is a command port."""
 
-    prompt = b"->"
+    kind, prompt = "confocal", b"->"
 
     def __init__(
         self,
@@ -297,17 +299,8 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
     ) -> None:
         """commands: the controller's port 23; None = keep its settings."""
         settings = settings or ConfocalDtSettings()
-        super().__init__(
-            transport,
-            replace(settings, free_running=settings.period > 0),
-            Channels(axes=wrapping(settings.axes, COUNTER_RANGE), timed=False),
-            kind="confocal",
-            period=settings.period,
-            patience=settings.patience,
-            commands=commands,
-            clocks=clocks,
-        )
-        self._wanted = settings
+        channels = Channels(axes=wrapping(settings.axes, COUNTER_RANGE), timed=False)
+        super().__init__(transport, settings, channels, *clocks, commands=commands)
         self._intensity_leads = False  # the order of the manual, until the data show another
 
     @property
@@ -377,9 +370,9 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         return (second, first) if self._intensity_leads else (first, second)
 
 
-def _check_not_silent(name: str, period: float, patience: float, silent: float) -> None:
+def _check_not_silent(name: str, settings: ControllerSettings, silent: float) -> None:
     """Raise NoSamplesError for a controller that keeps a period itself and sends nothing."""
-    if period and silent > patience:
+    if settings.period and silent > settings.patience:
         raise NoSamplesError(
             f"{name} sent no readable data for {silent:.1f} s; check power, output "
             "interface and (RS-422) baud rate"
