@@ -83,11 +83,9 @@ class DeviceReader:
             if not done.set_running_or_notify_cancel():
                 continue
             try:
-                result = request()
+                done.set_result(request())
             except Exception as err:  # raised where the request was made
                 done.set_exception(err)
-            else:
-                done.set_result(result)
 
     def run(self, stop: threading.Event) -> None:
         """Read until ``stop``."""

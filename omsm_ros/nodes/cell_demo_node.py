@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -57,20 +57,15 @@ class NodeProcesses:
         self._folder.mkdir(parents=True, exist_ok=True)
         return self
 
-    def start(self, node: str, **parameters: object) -> None:
-        """Start ``node`` with ROS parameters."""
-        self.start_as(node, node, (), **parameters)
-
-    def start_as(
-        self, label: str, node: str, arguments: Sequence[str], **parameters: object
-    ) -> None:
+    def start(self, node: str, *arguments: str, label: object = "", **parameters: object) -> None:
         """Start ``node``, called ``label`` here, with arguments for ROS and parameters."""
+        name = str(label or node)
         command = [sys.executable, "-m", "omsm_ros.nodes.start", node, "--ros-args", *arguments]
-        for name, value in parameters.items():
-            # ROS parses it as YAML, which includes JSON; a float keeps its point.
-            command += ["-p", f"{name}:={json.dumps(value)}"]
-        with (self._folder / f"{label}.log").open("ab") as log:
-            self._running[label] = subprocess.Popen(
+        # ROS parses it as YAML, which includes JSON; a float keeps its point.
+        given = (f"{parameter}:={json.dumps(value)}" for parameter, value in parameters.items())
+        command += [word for text in given for word in ("-p", text)]
+        with (self._folder / f"{name}.log").open("ab") as log:
+            self._running[name] = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
             )
 

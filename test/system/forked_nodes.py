@@ -83,7 +83,8 @@ class ForkedNodes(NodeProcesses):
         super().__init__(folder)
         self._server = server
 
-    def start_as(self, label, node, arguments, **parameters):
+    def start(self, node, *arguments, label="", **parameters):
+        label = label or node
         given = (w for n, v in parameters.items() for w in ("-p", f"{n}:={json.dumps(v)}"))
         command = [node, "--ros-args", *arguments, *given]
         self._running[label] = self._server.start(command, self._folder / f"{label}.log")

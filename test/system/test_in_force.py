@@ -114,7 +114,7 @@ def test_a_second_calibrator_does_not_take_the_first_ones_file_for_its_own(cell)
     output = str(cell.folder / "cal.json")
     cell.processes.start("calibrator", output=output)
     cell.wait("it", lambda: cell.operator.text("calibrator", "lifecycle") == "active")
-    cell.processes.start_as("second", "calibrator", ["-r", "__ns:=/cell2"], output=output)
+    cell.processes.start("calibrator", "-r", "__ns:=/cell2", label="second", output=output)
     with pytest.raises(Exception, match=r"second ended with exit code 2.*cal.json' is in use"):
         cell.wait("the end of the second", lambda: False)
     cell.processes._running.pop("second")

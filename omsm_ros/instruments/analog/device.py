@@ -212,11 +212,16 @@ class AnalogDevice:
         self,
         source: Converter,
         settings: BlockSettings,
+        sensitivity: float,
+        probe: ProbeReading | None = None,
         now_ns: Callable[[], int] = time.time_ns,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        """now_ns: the host clock of the stamps [ns];  monotonic: for the time lost [s]."""
+        """sensitivity: [V per unit of the quantity];  probe: its range begins at 0 V
+        now_ns: the host clock of the stamps [ns];  monotonic: for the time lost [s]
+        """
         self._source, self._settings = source, settings
+        self._sensitivity, self._probe = sensitivity, probe or ProbeReading()
         self._now_ns, self._monotonic = now_ns, monotonic
         self._clock = DeviceClock()
         self._waiting: FloatArray = np.empty((0, 0))
@@ -245,10 +250,8 @@ class AnalogDevice:
         self._waiting = np.concatenate([waiting, volts])
         newest = self._first + len(self._waiting) - 1
         self._clock.observe(self._device_ns(newest), self._now_ns())
-        blocks = []
-        while len(self._waiting) >= self._settings.block_size:
-            blocks.append(self._take(self._settings.block_size))
-        return blocks
+        size = self._settings.block_size
+        return [self._take(size) for _ in range(len(self._waiting) // size)]
 
     def close(self) -> list[Any]:
         """Stop and return the partial block, if any."""
@@ -287,14 +290,10 @@ class AnalogDevice:
 
 
 class AnalogAccelerometer(AnalogDevice):
-    """Reads three axes; an IEPE sensor has no response at 0 Hz, and no offset is removed."""
+    """Reads three axes; an IEPE sensor has no response at 0 Hz, and no offset is removed.
 
-    def __init__(
-        self, source: Converter, settings: BlockSettings, sensitivity: float, **clocks: Any
-    ) -> None:
-        """sensitivity: [V/(m/s²)]; the paper's PCB 356A17 has 0.5 V/g."""
-        super().__init__(source, settings, **clocks)
-        self._sensitivity = sensitivity
+    Its sensitivity is in V/(m/s²); the paper's PCB 356A17 has 0.5 V/g.
+    """
 
     def _block(self, volts: FloatArray, common: dict[str, Any]) -> AccelerationBlock:
         x, y, z = np.ascontiguousarray(volts.T / self._sensitivity)
@@ -302,19 +301,10 @@ class AnalogAccelerometer(AnalogDevice):
 
 
 class AnalogReference(AnalogDevice):
-    """Reads a displacement sensor; beyond its range there is no distance."""
+    """Reads a displacement sensor; beyond its range there is no distance.
 
-    def __init__(
-        self,
-        source: Converter,
-        settings: BlockSettings,
-        sensitivity: float,
-        probe: ProbeReading,
-        **clocks: Any,
-    ) -> None:
-        """sensitivity: [V/m], the paper's CPL190 has 80 mV/µm;  probe: its range begins at 0 V."""
-        super().__init__(source, settings, **clocks)
-        self._sensitivity, self._probe = sensitivity, probe
+    Its sensitivity is in V/m; the paper's CPL190 has 80 mV/µm.
+    """
 
     def _block(self, volts: FloatArray, common: dict[str, Any]) -> BlockPair:
         reading = volts[:, 0] / self._sensitivity

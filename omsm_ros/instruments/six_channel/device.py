@@ -79,16 +79,15 @@ _MOST_PARTS = MOST_COUNTS * PARTS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CsvSettings(BlockSettings):
+class CsvSettings(StreamSettings):
     """Settings of the text stream.
 
-    columns: of a line, in order;  scaling: counts ↔ SI;  modulus: of the sequence
+    columns: of a line, in order;  modulus: of the sequence
     parts: of a count that are resolved;  homed: as of Channels
     An axis without a column stays at its offset.
     """
 
     columns: tuple[str, ...] = COLUMNS
-    scaling: StreamScaling = field(default_factory=StreamScaling)
     modulus: int = 2**32
     parts: int = PARTS
     homed: bool = False
@@ -104,10 +103,9 @@ class CsvStreamDevice(StreamDevice):
     ) -> None:
         settings = settings or CsvSettings()
         self._columns, self._probe = settings.columns, settings.scaling.probe
-        self._parts = settings.parts
+        self._parts = n = settings.parts
         timed = "device_time" in settings.columns
         has_axes = bool(set(AXES) & set(settings.columns))
-        n = settings.parts
         in_parts = (
             replace(axis, counts_per_unit=axis.counts_per_unit * n, wrap=axis.wrap * n)
             for axis in settings.scaling.axes
@@ -116,7 +114,7 @@ class CsvStreamDevice(StreamDevice):
         channels = Channels("distance" in settings.columns, axes, timed, settings.homed)
         counting = Counting(settings.modulus, timed=timed, checked=False)
         super().__init__(transport, settings, channels, counting, *clocks)
-        self._decoder = CsvDecoder(settings.columns, _MOST_PARTS // settings.parts)
+        self._decoder = CsvDecoder(settings.columns, _MOST_PARTS // n)
 
     def _decode(self, data: bytes) -> Samples:
         rows = self._decoder.feed(data)

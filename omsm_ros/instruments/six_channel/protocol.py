@@ -184,20 +184,7 @@ _ANY = rb"[^,;\s]+"
 # Numbers beyond these ranges are damage: counts that no counter reaches, times of centuries,
 # positions of hundreds of metres in tenths of a nanometre.
 MOST_COUNTS = 2**40
-_RANGES = {"sequence": (0, 2**52), "device_time": (-(2**62), 2**62)}
-_OTHER_RANGE = (-(2**62), 2**62)
-
-
-def check_columns(columns: Sequence[str]) -> None:
-    """Raise ConfigurationError unless ``columns`` are valid.
-
-    Each is one of COLUMNS, once, or SKIPPED; the sequence, and distance or an axis, are required.
-    """
-    named = [name for name in columns if name != SKIPPED]
-    if set(named) - set(COLUMNS) or len(set(named)) < len(named):
-        raise ConfigurationError(f"columns {columns!r}, expected {COLUMNS!r}, each at most once")
-    if "sequence" not in named or not {"distance", *AXES} & set(named):
-        raise ConfigurationError(f"columns {columns!r} need a sequence, and distance or axes")
+_SEQUENCE_RANGE, _OTHER_RANGE = (0, 2**52), (-(2**62), 2**62)
 
 
 def row_dtype(columns: Sequence[str]) -> np.dtype[np.void]:
@@ -220,15 +207,22 @@ class CsvDecoder:
     """Decodes bytes in any portions to rows; it never raises, memory is a line and a portion."""
 
     def __init__(self, columns: Sequence[str] = COLUMNS, most_counts: int = MOST_COUNTS) -> None:
-        """Raise ConfigurationError for columns that are not valid."""
-        check_columns(columns)
+        """Raise ConfigurationError unless ``columns`` are valid.
+
+        Each is one of COLUMNS, once, or SKIPPED; sequence, and distance or an axis, are required.
+        """
+        named = [name for name in columns if name != SKIPPED]
+        if set(named) - set(COLUMNS) or len(set(named)) < len(named):
+            raise ConfigurationError(
+                f"columns {columns!r}, expected {COLUMNS!r}, each at most once"
+            )
+        if "sequence" not in named or not {"distance", *AXES} & set(named):
+            raise ConfigurationError(f"columns {columns!r} need a sequence, and distance or axes")
         words = [_ANY if n == SKIPPED else _INTEGER if n in _WHOLE else _NUMBER for n in columns]
         self._line = re.compile(rb"[,;\s]*" + rb"[,;\s]+".join(words) + rb"[,;\s]*")
-        ranges = _RANGES | dict.fromkeys(AXES, (-most_counts, most_counts))
+        ranges = {"sequence": _SEQUENCE_RANGE} | dict.fromkeys(AXES, (-most_counts, most_counts))
         self._read = [
-            (int if name in _WHOLE else float, *ranges.get(name, _OTHER_RANGE))
-            for name in columns
-            if name != SKIPPED
+            (int if name in _WHOLE else float, *ranges.get(name, _OTHER_RANGE)) for name in named
         ]
         self._dtype = row_dtype(columns)
         self._tail = b""
