@@ -213,10 +213,6 @@ def _zstd(data: bytes, size: int, exactly: bool = True) -> bytes:
     return _bounded(storage_mcap.zstd.ZstdDecompressor().decompress, data, size, exactly)
 
 
-def _lz4(data: bytes, size: int) -> bytes:
-    return _bounded(LZ4FrameDecompressor().decompress, data, size, True)
-
-
 def _bounded(decompress: Callable[..., bytes], data: bytes, size: int, exactly: bool) -> bytes:
     most = min(MAX_CHUNK_BYTES, _MOST_PACKED * len(data) + _ALWAYS_UNPACKED_BYTES)
     if exactly and size > most:
@@ -258,7 +254,10 @@ def _check_tables(base: Any) -> None:
 
 storage_sqlite3.apsw.connection_hooks.append(_check_tables)
 # rosbags checks sizes only after unpacking.
-storage_mcap.DECOMPRESSORS |= {"zstd": _zstd, "lz4": _lz4}
+storage_mcap.DECOMPRESSORS |= {
+    "zstd": _zstd,
+    "lz4": lambda data, size: _bounded(LZ4FrameDecompressor().decompress, data, size, True),
+}
 bag_folder.zstd = SimpleNamespace(open=_Unpacked, decompress=unpacked_message)
 # A few bytes of nested aliases become gigabytes when an error message shows them.
 for _module in (bag_folder, storage_mcap, storage_sqlite3):

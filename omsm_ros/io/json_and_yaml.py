@@ -285,12 +285,6 @@ _KINDS = {
 }  # fmt: skip
 
 
-def _as_number(value: object) -> str:
-    """Return the remedy for a text ``value`` in the place of a number; empty for others."""
-    text = isinstance(value, str)
-    return "; write digits with a decimal point, without unit and quotes" if text else ""
-
-
 def _said_of_schemas(found: jsonschema.ValidationError) -> str:
     place = found.json_path.removeprefix("$").removeprefix(".")
     said = f"{place} is {shown(found.instance)}" if place else ""
@@ -308,7 +302,8 @@ def _said_of_schemas(found: jsonschema.ValidationError) -> str:
             return f"{missing[0]} is required and missing; write it there"
         case "type":
             kinds = [wanted] if isinstance(wanted, str) else wanted
-            hint = _as_number(found.instance) if "number" in kinds else ""  # type: ignore[operator]
+            text = "number" in kinds and isinstance(found.instance, str)  # type: ignore[operator]
+            hint = "; write digits with a decimal point, without unit and quotes" if text else ""
             return f"{said}, expected {' or '.join(_KINDS[kind] for kind in kinds)}{hint}"  # type: ignore[union-attr]
         case "minimum" | "maximum":
             low, high = (found.schema.get(name) for name in ("minimum", "maximum"))  # type: ignore[union-attr]

@@ -25,14 +25,12 @@ from omsm_ros.core.form.part_figures import (
     SECOND_ORDER,
     SYMMETRIC,
     TILT,
+    SmoothTerms,
     best_fit,
     fitted,
     length,
-    less,
-    products,
     rms_of_part,
     short_waves,
-    without_terms,
 )
 from omsm_ros.core.form.texture import (
     Bands,
@@ -100,46 +98,43 @@ def with_pose_uncertainty(fit: ZernikeFit, map_: DeviationMap, found: Registrati
     return replace(fit, effects=effects)
 
 
-def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, UncertainValue]:
+def optical_terms(smooth: SmoothTerms, fit: ZernikeFit) -> dict[str, UncertainValue]:
     """Return the terms of ISO 10110-5 for deviations along the normal of the surface, each [m].
+
+    smooth: SYMMETRIC terms of the map and others;  fit: of all its terms
 
     A (sagitta deviation) is the peak to valley of the power fitted together with piston and
     tilts; C that of the rotationally symmetric part of the rest. RMSt is the rms without piston
     and tilts, RMSi also without power, and RMSa the rms of the asymmetric rest.
     """
-    columns = zernike_values(*fit.disc.scaled(map_.x, map_.y), SYMMETRIC)
-    weighted, power = columns * map_.area, slice(len(POWER))
-    gram, right = weighted @ columns.T, products(map_, weighted)
-    even, best_sphere = fitted(gram, right), fitted(gram[power, power], right[power])
-    symmetric = np.concatenate([even, _noise_of_rings(map_.noise, weighted, gram)], axis=1)
-    symmetric[power, : right.shape[1]] -= best_sphere
+    map_ = smooth.map
+    best_sphere, shares = (fitted(*smooth.sums(terms)) for terms in (POWER, SYMMETRIC))
+    shares[: len(POWER)] -= best_sphere
+    symmetric = np.concatenate([shares, _noise_of_rings(smooth)], axis=1)
     # A function of the distance from the middle, whose largest and least are kept.
-    reach = np.argsort(columns[POWER.index(ZernikeIndex(2, 0))])
+    reach = np.argsort(np.hypot(map_.x - fit.disc.x, map_.y - fit.disc.y))
     few = reach[np.linspace(0, len(reach) - 1, min(len(reach), _MOST_POINTS)).astype(np.int64)]
-    rings = replace(
-        map_.part(few),
-        deviation=symmetric[:, 0] @ columns[:, few],
-        effects=symmetric[:, 1:].T @ columns[:, few],
-        noise=0.0,
-    )
+    columns = zernike_values(*fit.disc.scaled(map_.x[few], map_.y[few]), SYMMETRIC)
+    deviation, effects = symmetric[:, 0] @ columns, symmetric[:, 1:].T @ columns
+    rings = replace(map_.part(few), deviation=deviation, effects=effects, noise=0.0)
     return {
         "iso10110_A": _sagitta(map_, fit, float(best_sphere[-1, 0])),
         "iso10110_C": extents_of_parts([rings], fit.disc)[0][0],
-        "iso10110_RMSt": rms_of_part(without_terms(map_, fit.disc, TILT)),
-        "iso10110_RMSi": rms_of_part(less(map_, columns[power], best_sphere)),
-        "iso10110_RMSa": rms_of_part(less(map_, columns, even)),
+        "iso10110_RMSt": rms_of_part(smooth.without(TILT)),
+        "iso10110_RMSi": rms_of_part(smooth.without(POWER)),
+        "iso10110_RMSa": rms_of_part(smooth.without(SYMMETRIC)),
     }
 
 
-def _noise_of_rings(noise: float, weighted: FloatArray, gram: FloatArray) -> FloatArray:
-    """Return the noise of the symmetric irregularity, as independent shares of SYMMETRIC (k, s).
-
-    noise: of a point [m];  weighted: values of the terms times area (k, n);  gram: of them (k, k)
-    """
+def _noise_of_rings(smooth: SmoothTerms) -> FloatArray:
+    """Return the noise of the symmetric irregularity, as independent shares of SYMMETRIC (k, s)."""
     power, own = slice(len(POWER)), slice(len(POWER), None)
-    half = fitted(gram[own, own], weighted[own] @ weighted[own].T)
+    gram, _ = smooth.sums(SYMMETRIC)
+    places = smooth.disc.scaled(smooth.map.x, smooth.map.y)
+    weighted = zernike_values(*places, SYMMETRIC[own]) * smooth.map.area
+    half = fitted(gram[own, own], weighted @ weighted.T)
     covariance = fitted(gram[own, own], half.T)
-    root = noise * root_of(covariance).T
+    root = smooth.map.noise * root_of(covariance).T
     return np.concatenate([-fitted(gram[power, power], gram[power, own]) @ root, root])
 
 
@@ -233,20 +228,20 @@ def analyse_form(
     uncovered, outline = best_covered(x, y, found.spacing, aperture or found.disc, aperture is None)
     bounded = [*[n for n, s in enumerate(sources) if s in bounds], *held]
     map_ = gathered.map(found, area_weights(x, y, even=even, outline=outline), bounded)
-    points, terms = (map_.x, map_.y, map_.deviation), ZERNIKES[: len(map_) // 2]
-    area, effects, rim = map_.area, map_.effects, (outline, found.spacing)
-    fit = fit_zernikes(*points, terms, found.disc, weights=area, effects=effects, rim=rim)
+    smooth, terms = SmoothTerms.of(map_, found.disc, ZERNIKES), ZERNIKES[: len(map_) // 2]
+    fit = fit_zernikes(
+        map_.x, map_.y, map_.deviation, terms, found.disc, weights=map_.area,
+        rim=(outline, found.spacing), sums=smooth.sums(terms),
+    )  # fmt: skip
     zernike = with_pose_uncertainty(fit, map_, found)
     cells = GridCells.of(map_, even=even)
     bands = bands_of(cells, *filters)
-    figures, rest = _figures(map_, gathered, found, outline, even)
+    figures, textures = _figures(smooth, cells, bands, found, outline, even)
     return FormResult(
         registration=found,
         aperture=outline,
         map=map_,
-        deviation=figures
-        | optical_terms(map_, zernike)
-        | _textures(map_, cells, rest, bands, found, None if even else outline),
+        deviation=figures | gathered.as_measured(map_) | optical_terms(smooth, zernike) | textures,
         zernike=zernike,
         bands=bands,
         profiles=profiles(map_, found.disc),
@@ -258,54 +253,42 @@ def analyse_form(
 
 
 def _figures(
-    map_: DeviationMap, gathered: _Gathered, found: Registration, outline: Aperture, even: bool
-) -> tuple[dict[str, UncertainValue], GridCells]:
-    """Return figures of the map, and the cells of it without its second order."""
-    rest = without_terms(map_, found.disc, SECOND_ORDER)
-    fitted, square = best_fit(map_), np.average(map_.deviation**2, weights=map_.area)
-    maps = [map_, fitted, rest, without_terms(map_, found.disc, POWER)]
+    smooth: SmoothTerms,
+    cells: GridCells,
+    bands: Bands,
+    found: Registration,
+    outline: Aperture,
+    even: bool,
+) -> tuple[dict[str, UncertainValue], dict[str, UncertainValue]]:
+    """Return figures of the map, and its texture with slopes;  cells: of it."""
+    map_, rest = smooth.map, smooth.without(SECOND_ORDER)
+    rest_cells = GridCells.of(rest, even=even)
+    maps = [map_, best_fit(map_), rest, smooth.without(POWER)]
     extents = extents_of_parts(maps, found.disc, outline, found.spacing)
-    whole, robust, _ = extents[0]
+    sizes = [rms_of_part(each, extent[2]) for each, extent in zip(maps, extents, strict=True)]
+    del maps, rest  # each is as large as the map
     figures = {
         # Irregularity: the peak to valley without piston, tilts and power.
         "iso10110_B": extents[3][0],
-        "peak_to_valley": whole,
-        "robust_peak_to_valley": robust,
-        "rms": rms_of_part(map_, extents[0][2]),
+        "peak_to_valley": extents[0][0],
+        "robust_peak_to_valley": extents[0][1],
+        "rms": sizes[0],
         "peak_to_valley_best_fit": extents[1][0],
-        "rms_best_fit": rms_of_part(fitted, extents[1][2]),
+        "rms_best_fit": sizes[1],
         "peak_to_valley_without_second_order": extents[2][0],
-        "rms_without_second_order": rms_of_part(rest, extents[2][2]),
+        "rms_without_second_order": sizes[2],
         "edge_roll_off": edge_roll_off(map_, outline),
-        # These are as measured, with noise and systematic errors.
-        "peak_to_valley_of_points": UncertainValue(gathered.most - gathered.least, None),
-        "rms_of_points": UncertainValue(float(np.sqrt(square)), None),
-        # A profile measured once does not tell noise from texture.
-        "point_noise": UncertainValue(map_.noise if map_.noise_known else None, None),
-        "rms_before_fit": UncertainValue(found.before, None),
     }
-    return figures, GridCells.of(rest, even=even)
-
-
-def _textures(
-    map_: DeviationMap,
-    cells: GridCells,
-    rest: GridCells,
-    bands: Bands,
-    found: Registration,
-    outline: Aperture | None,
-) -> dict[str, UncertainValue]:
-    """Return texture and slopes;  cells, rest: of the map, and of it without its second order."""
-    points = without_terms(map_, found.disc, FORM)
-    formless = GridCells.of(points, even=outline is None)
+    points = smooth.without(FORM)
+    formless = GridCells.of(points, even=even)
     # Without an S-filter the surface has waves that the cells do not resolve.
-    resolved = cells.width == 0 or bands.s_filter is not None
-    points = points if resolved else short_waves(points, formless, bands.l_filter)
-    made = texture(cells, formless, bands, None if resolved else points, rest)
-    if not resolved:
-        whole, _, beyond = extents_of_parts([points], found.disc, outline, found.spacing)[0]
-        made |= {"Sq": rms_of_part(points, beyond), "Sz": whole}
-    return made
+    if cells.width == 0 or bands.s_filter is not None:
+        return figures, texture(cells, formless, bands, None, rest_cells)
+    points = short_waves(points, formless, bands.l_filter)
+    textures = texture(cells, formless, bands, points, rest_cells)
+    edge = None if even else outline
+    [(whole, _, beyond)] = extents_of_parts([points], found.disc, edge, found.spacing)
+    return figures, textures | {"Sq": rms_of_part(points, beyond), "Sz": whole}
 
 
 class _Gathered:
@@ -380,6 +363,17 @@ class _Gathered:
             moves=found.moves,
             taken=found.taken,
         )
+
+    def as_measured(self, map_: DeviationMap) -> dict[str, UncertainValue]:
+        """Return figures of the points, with noise and systematic errors."""
+        found = {
+            "peak_to_valley_of_points": self.most - self.least,
+            "rms_of_points": float(np.sqrt(np.average(map_.deviation**2, weights=map_.area))),
+            # A profile measured once does not tell noise from texture.
+            "point_noise": map_.noise if map_.noise_known else None,
+            "rms_before_fit": self._found.before,
+        }
+        return {name: UncertainValue(value, None) for name, value in found.items()}
 
     def _point_noise(self, rows: FloatArray, fitted: float) -> tuple[float, bool, float]:
         """Return the noise of a point [m], whether it is certainly no texture, and its error [m].

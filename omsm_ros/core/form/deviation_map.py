@@ -319,10 +319,7 @@ class GridCells:
         return rows, columns, np.maximum(rows @ self.present @ columns, np.finfo(np.float64).tiny)
 
 
-Sides = tuple[tuple[float, float], float]
-
-
-def _of_scattered(x: FloatArray, y: FloatArray) -> Sides:
+def _of_scattered(x: FloatArray, y: FloatArray) -> tuple[tuple[float, float], float]:
     """Return the sides of square cells [m], and the place of the first point in its own [cells]."""
     spans = float(np.ptp(x)), float(np.ptp(y))
     # The area of a strip is at least 1e-6 of a square's, to keep the cells finite.
@@ -334,7 +331,7 @@ def _of_scattered(x: FloatArray, y: FloatArray) -> Sides:
     return (pitch, pitch), 1e-9
 
 
-def _of_grid(x: FloatArray, y: FloatArray) -> Sides | None:
+def _of_grid(x: FloatArray, y: FloatArray) -> tuple[tuple[float, float], float] | None:
     """Return the same for cells that hold one point each of a grid, or whole blocks of them.
 
     None for a grid that is turned, so that its points form no columns and rows.

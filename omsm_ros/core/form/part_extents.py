@@ -85,10 +85,10 @@ def extents_of_parts(
     outline: Aperture | None = None,
     spacing: float = 0.0,
 ) -> list[tuple[UncertainValue, UncertainValue, tuple[float, float]]]:
-    """Return peak to valley and extent of 99.5 % of the area of maps that differ by smooth form.
+    """Return the peak to valley of maps that differ by smooth form.
 
-    Third is the mean square that form between the last track and the rim adds, and its standard
-    uncertainty [m²].
+    Second is the extent of 99.5 % of the area, of the first map only. Third is the mean square that
+    form between the last track and the rim adds, and its standard uncertainty [m²].
 
     disc: of the smooth terms
     outline: of the part, None for a map without gaps;  spacing: distance of the tracks [m]
@@ -101,7 +101,8 @@ def extents_of_parts(
         ]
     form = _PartForm.of(maps[0], disc)
     gaps = _Gaps.of(maps[0], outline, spacing) if outline else None
-    return [form.extents(map_, map_.deviation - maps[0].deviation, gaps) for map_ in maps]
+    shifts = (map_.deviation - maps[0].deviation for map_ in maps)
+    return [form.extents(m, s, gaps, m is maps[0]) for m, s in zip(maps, shifts, strict=True)]
 
 
 class _PartForm(NamedTuple):
@@ -146,7 +147,7 @@ class _PartForm(NamedTuple):
         return cls(value, fit, cell, error, value - mean, local, blurred, waves, unseen)
 
     def extents(
-        self, map_: DeviationMap, shift: FloatArray, gaps: _Gaps | None
+        self, map_: DeviationMap, shift: FloatArray, gaps: _Gaps | None, robust: bool
     ) -> tuple[UncertainValue, UncertainValue, tuple[float, float]]:
         """Return the extents of the ``map_`` whose form differs by a smooth ``shift`` (n,) [m]."""
         form = self.value + shift
@@ -159,7 +160,8 @@ class _PartForm(NamedTuple):
         of_waves = [np.max(way * form + self.texture) - np.max(way * form) for way in (-1, 1)]
         found = []
         many = form[_equal_areas(map_.area, _MOST_FITTED)]
-        for ends, all_, count in (((0.0, 1.0), form, len(some)), (ROBUST, many, len(even))):
+        shares = ((0.0, 1.0), form, len(some)), (ROBUST, many, len(even))
+        for ends, all_, count in shares[: 1 + robust]:
             of_some, *ways = (_extents(way[:count], ends) for way in (form[some], *drawn))
             again, more, likely, full, noise = (way**2 for way in ways)
             bare, open_ = _without_noise(float(of_some), ways[-1])
@@ -176,9 +178,8 @@ class _PartForm(NamedTuple):
             figure = of_square(square, of_all)
             between = np.append(np.maximum(beyond, of_waves), -alone) / 2 * (all_ is form)
             value = (figure.value or 0.0) + _extents(all_, ends) - of_some + float(np.sum(between))
-            spread = length(figure.uncertainty or 0.0, *between)
-            found.append(UncertainValue(float(value), spread))
-        return found[0], found[1], more_square
+            found.append(UncertainValue(float(value), length(figure.uncertainty or 0.0, *between)))
+        return found[0], found[1] if robust else UncertainValue(None, None), more_square
 
 
 def _without_noise(once: float, again: FloatArray) -> tuple[float, float]:
@@ -186,18 +187,16 @@ def _without_noise(once: float, again: FloatArray) -> tuple[float, float]:
 
     It may be negative by chance. Second is the standard uncertainty of the extrapolation [m].
     """
-    found = []
-    for power in _POWERS:
-        left = once**power - (np.mean(again**power) - once**power) / (2 ** (power / 2) - 1)
-        found.append(float(np.sign(left) * abs(left) ** (1 / power)))
+    left = [once**p - (np.mean(again**p) - once**p) / (2 ** (p / 2) - 1) for p in _POWERS]
+    found = [float(np.sign(v) * abs(v) ** (1 / p)) for v, p in zip(left, _POWERS, strict=True)]
     return found[1], float(np.ptp(found)) / np.sqrt(12)
 
 
 def _extents(values: FloatArray, ends: tuple[float, float]) -> FloatArray:
     """Return the distances between the quantiles ``ends`` along the first axis."""
-    if ends == (0.0, 1.0):
-        return np.asarray(np.ptp(values, axis=0))
-    return np.asarray(np.ptp(np.quantile(values, ends, axis=0, method="hazen"), axis=0))
+    if ends != (0.0, 1.0):
+        values = np.quantile(values, ends, axis=0, method="hazen")
+    return np.asarray(np.ptp(values, axis=0))
 
 
 def _equal_areas(area: FloatArray, most: int) -> IntArray:
@@ -451,9 +450,9 @@ def _smooth(map_: DeviationMap, disc: Aperture) -> ZernikeFit:
     """Return smooth terms of the deviations, of as high an order as the points show."""
     orders = [n for n in _ORDERS if _PER_TERM * sum(t.n <= n for t in _TERMS) <= len(map_)] or [0]
     every = [term for term in _TERMS if term.n <= orders[0]]
-    weighted = (columns := zernike_values(*disc.scaled(map_.x, map_.y), every)) * map_.area
-    gram, squares = weighted @ columns.T, weighted @ weighted.T
-    right = weighted @ map_.deviation
+    columns = zernike_values(*disc.scaled(map_.x, map_.y), every) * (root := np.sqrt(map_.area))
+    gram, right = columns @ columns.T, columns @ (map_.deviation * root)
+    squares = (weighted := columns * root) @ weighted.T
     for order, lower in zip(orders, [*orders[1:], -1], strict=True):
         terms = [term for term in every if term.n <= order]
         kept = separable(gram[: len(terms), : len(terms)], terms, _CONDITION)
@@ -465,8 +464,9 @@ def _smooth(map_: DeviationMap, disc: Aperture) -> ZernikeFit:
         chi_square = float(found @ np.linalg.solve(covariance + _TINY * np.eye(free), found))
         if chi_square > free + _CHANCE * np.sqrt(2 * free):
             break
-    points = (map_.x, map_.y, map_.deviation)
-    return fit_zernikes(*points, terms, disc, weights=map_.area, condition=_CONDITION)
+    points, known = (map_.x, map_.y, map_.deviation), slice(len(terms))
+    sums = gram[known, known], right[known, np.newaxis]
+    return fit_zernikes(*points, terms, disc, weights=map_.area, condition=_CONDITION, sums=sums)
 
 
 def _drawn(

@@ -6,13 +6,17 @@ to the figure. Upper bounds of errors, as of an unknown latency, are not subtrac
 the square by an error of that size belongs to the uncertainty.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import replace
 from math import comb
+from typing import NamedTuple
 
 import numpy as np
 
 from omsm_ros.core.form.deviation_map import DeviationMap, GridCells, UncertainValue
-from omsm_ros.core.form.zernike_fit import DIFFERENCES, passes
+from omsm_ros.core.form.zernike_fit import CHUNK, DIFFERENCES, normal_equations, passes
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
@@ -126,26 +130,18 @@ def of_square(square: float, spread: float) -> UncertainValue:
 def without_columns(map_: DeviationMap, columns: FloatArray) -> DeviationMap:
     """Return the map without its area-weighted fit of ``columns`` (k, n), effects included."""
     weighted = columns * map_.area
-    return less(map_, columns, fitted(weighted @ columns.T, products(map_, weighted)))
-
-
-def products(map_: DeviationMap, weighted: FloatArray) -> FloatArray:
-    """Return the sums (k, 1 + e) of ``weighted`` columns (k, n) times deviation and effects."""
-    return np.column_stack([weighted @ map_.deviation, weighted @ map_.effects.T])
-
-
-def fitted(gram: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve normal equations; for points on a line, where columns coincide, by minimum norm."""
-    return np.asarray(np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ right)
-
-
-def less(map_: DeviationMap, columns: FloatArray, shares: FloatArray) -> DeviationMap:
-    """Return the map less ``shares`` (k, 1 + e) of ``columns`` (k, n)."""
+    right = np.column_stack([weighted @ map_.deviation, weighted @ map_.effects.T])
+    shares = fitted(weighted @ columns.T, right)
     return replace(
         map_,
         deviation=map_.deviation - shares[:, 0] @ columns,
         effects=map_.effects - shares[:, 1:].T @ columns,
     )
+
+
+def fitted(gram: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve normal equations; for points on a line, where columns coincide, by minimum norm."""
+    return np.asarray(np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ right)
 
 
 def best_fit(map_: DeviationMap) -> DeviationMap:
@@ -158,11 +154,40 @@ def best_fit(map_: DeviationMap) -> DeviationMap:
     return without_columns(map_, moves[size > 0] / size[size > 0, np.newaxis])
 
 
-def without_terms(
-    map_: DeviationMap, disc: Aperture, terms: tuple[ZernikeIndex, ...]
-) -> DeviationMap:
-    """Return the map without its area-weighted fit of Zernike ``terms``."""
-    return without_columns(map_, zernike_values(*disc.scaled(map_.x, map_.y), terms))
+class SmoothTerms(NamedTuple):
+    """Zernike ``terms`` of a map on a ``disc``, and sums from which each choice of them is fitted.
+
+    gram: area-weighted products of the terms (k, k);  right: with deviation and effects (k, 1 + e)
+    """
+
+    map: DeviationMap
+    disc: Aperture
+    terms: tuple[ZernikeIndex, ...]
+    gram: FloatArray
+    right: FloatArray
+
+    @classmethod
+    def of(cls, map_: DeviationMap, disc: Aperture, terms: Sequence[ZernikeIndex]) -> SmoothTerms:
+        """Return the ``terms`` of a map."""
+        values = np.vstack([map_.deviation, map_.effects])
+        sums = normal_equations(map_.x, map_.y, values, terms, disc, map_.area)
+        return cls(map_, disc, tuple(terms), *sums)
+
+    def sums(self, terms: Sequence[ZernikeIndex]) -> tuple[FloatArray, FloatArray]:
+        """Return the sums of some of the ``terms``: (t, t) and (t, 1 + e)."""
+        chosen = [self.terms.index(term) for term in terms]
+        return self.gram[np.ix_(chosen, chosen)], self.right[chosen]
+
+    def without(self, terms: Sequence[ZernikeIndex]) -> DeviationMap:
+        """Return the map without the fit of some of the ``terms``."""
+        shares, map_ = fitted(*self.sums(terms)), self.map
+        deviation, effects = np.empty_like(map_.deviation), np.empty_like(map_.effects)
+        for begin in range(0, len(map_), CHUNK):
+            part = slice(begin, begin + CHUNK)
+            columns = zernike_values(*self.disc.scaled(map_.x[part], map_.y[part]), terms)
+            deviation[part] = map_.deviation[part] - shares[:, 0] @ columns
+            effects[:, part] = map_.effects[:, part] - shares[:, 1:].T @ columns
+        return replace(map_, deviation=deviation, effects=effects)
 
 
 def short_waves(map_: DeviationMap, cells: GridCells, longest: float) -> DeviationMap:

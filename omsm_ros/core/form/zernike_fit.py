@@ -109,6 +109,7 @@ def fit_zernikes(
     effects: FloatArray | None = None,
     condition: float = _WORST_CONDITION,
     rim: tuple[Aperture, float] | None = None,
+    sums: tuple[FloatArray, FloatArray] | None = None,
 ) -> ZernikeFit:
     """Fit ``terms`` to ``deviation`` [m] at x, y [m] of the part, each (n,), by least squares.
 
@@ -117,15 +118,17 @@ def fit_zernikes(
     condition: largest condition number of the terms; with a larger one the highest are left out
     rim: outline of the part and distance of the tracks [m]; form that no term describes is then
         continued from the last tracks to the outline, unless that is a polygon
+    sums: what :func:`normal_equations` returns for these terms and weights, if it is known
 
     The covariance includes errors that are correlated over a pass of the path. Raises DataError
     for fewer than two points a term, or points that determine no term.
     """
     if len(x) < (least := max(2 * len(terms), 8)):
         raise DataError("form.few_points_for_terms", points=len(x), terms=len(terms), least=least)
-    more = np.empty((0, len(x))) if effects is None else effects
-    values = np.concatenate([deviation[np.newaxis], more])
-    gram, right = _normal_equations(x, y, values, terms, disc, weights)
+    if sums is None:
+        values = deviation[np.newaxis] if effects is None else np.vstack([deviation, effects])
+        sums = normal_equations(x, y, values, terms, disc, weights)
+    gram, right = sums
     kept = separable(gram, terms, condition)
     gram, right = gram[np.ix_(kept, kept)], right[kept]
     used = tuple(terms[k] for k in kept)
@@ -260,7 +263,7 @@ def _fading(inwards: FloatArray) -> FloatArray:
     return np.asarray(1 - s**3 * (10 - 15 * s + 6 * s**2))
 
 
-def _normal_equations(
+def normal_equations(
     x: FloatArray,
     y: FloatArray,
     values: FloatArray,
@@ -268,13 +271,15 @@ def _normal_equations(
     disc: Aperture,
     weights: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
+    """Return the weighted products of the ``terms`` (k, k), and with the ``values`` (k, v)."""
     gram, right = np.zeros((len(terms), len(terms))), np.zeros((len(terms), len(values)))
     for begin in range(0, len(x), CHUNK):
         chunk = slice(begin, begin + CHUNK)
         columns = zernike_values(*disc.scaled(x[chunk], y[chunk]), terms)
-        weighted = columns if weights is None else columns * weights[chunk]
-        gram += weighted @ columns.T
-        right += weighted @ values[:, chunk].T
+        root = np.ones(len(x[chunk])) if weights is None else np.sqrt(weights[chunk])
+        columns *= root
+        gram += columns @ columns.T  # numpy takes half the time for an array with itself
+        right += columns @ (values[:, chunk] * root).T
     return gram, right
 
 

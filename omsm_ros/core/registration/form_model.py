@@ -319,20 +319,13 @@ def outlier_limit(residual: FloatArray) -> float:
     return max(OUTLIER_SIGMAS * statistics.spread(residual), _BEYOND_COMMON * common, LEAST_LIMIT_M)
 
 
-class FreeFit(NamedTuple):
-    """Coefficients (q,) of columns, and residual (n,) [m] of their sum.
-
-    near: points within its outlier limit (n,);  gram: products of the columns over these (q, q)
-    """
-
-    coefficients: FloatArray
-    residual: FloatArray
-    near: BoolArray
-    gram: FloatArray
-
-
-def best_matching_sum(columns: FloatArray, deviation: FloatArray) -> FreeFit:
+def best_matching_sum(
+    columns: FloatArray, deviation: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray]:
     """Return the fit of ``columns`` (q, n) to the ``deviation`` (n,) [m] without its outliers.
+
+    Coefficients (q,), residual (n,) [m], which points are within its outlier limit (n,), and
+    products of the columns over these (q, q).
 
     The fit is free of any prior, because the residual of a large step or of an unknown form is
     neither noise nor an outlier.
@@ -355,4 +348,4 @@ def best_matching_sum(columns: FloatArray, deviation: FloatArray) -> FreeFit:
         # Few are beyond the limit: to take them off is less work than to copy all others.
         far = columns[:, ~near]
         gram = whole - far @ far.T
-    return FreeFit(fitted, residual, near, gram)
+    return fitted, residual, near, gram

@@ -370,7 +370,7 @@ class _PoseFit:
             gram = sums.gram[: len(found.step), : len(found.step)]
             square = float(found.step @ gram @ found.step) / sums.points
             still = square < settled**2 or found.length < _SHARE_OF_UNCERTAINTY
-            if turn > 3 and still:
+            if turn > 1 and still:
                 smooth = np.concatenate([found.step, found.form]) @ columns
                 limit = outlier_limit(points.deviation - smooth)
                 return _PlacementState(at, like, limit, found, sums)

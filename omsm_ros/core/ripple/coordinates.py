@@ -115,15 +115,11 @@ def _coordinate(
     typical = float(np.median(abs(np.diff(values)) / np.diff(signal.sample)))
     nyquist = 0.5 / max(typical, float(np.ptp(values)) / _MOST_FREQUENCIES)
     for other in before.values():
-        if other.like == other.name and _proportional(values, other.values) * nyquist < _SAME_WAVES:
+        away = other.values - other.values[0]
+        line = np.polyval(np.polyfit(away, values, 1), away)
+        if other.like == other.name and np.max(abs(values - line)) * nyquist < _SAME_WAVES:
             return Coordinate(name, values, pace, other.name, nyquist)
     return Coordinate(name, values, pace, name, nyquist)
-
-
-def _proportional(values: FloatArray, other: FloatArray) -> float:
-    """Return the largest deviation of ``values`` from a linear function of ``other``."""
-    slope, start = np.polyfit(other - other[0], values, 1)
-    return float(np.max(abs(values - slope * (other - other[0]) - start)))
 
 
 def power_over(

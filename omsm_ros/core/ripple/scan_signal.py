@@ -198,10 +198,5 @@ def sampling_over(signal: ScanSignal, places: int = 5) -> list[Sampling]:
         (middle <= outer) & (middle >= inner)
         for outer, inner in pairwise(np.linspace(high, low, count + 1))
     ]
-    return [_sampling(middle[ring], distance[ring]) for ring in rings if ring.any()]
-
-
-def _sampling(radius: FloatArray, distance: FloatArray) -> Sampling:
-    typical = float(np.median(distance))
-    middle = float(np.median(radius))
-    return Sampling(radius=middle, distance=typical, shortest_wavelength=2 * typical)
+    usual = [np.median([middle[r], distance[r]], axis=1).tolist() for r in rings if r.any()]
+    return [Sampling(radius=at, distance=step, shortest_wavelength=2 * step) for at, step in usual]

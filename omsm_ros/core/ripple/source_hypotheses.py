@@ -365,13 +365,11 @@ class Attribution:
 
     def open_sources(self, key: Key) -> list[SourceHypothesis]:
         """Return the sources of a line with a partner that no other source explains, else all."""
-        every = self.evidence[key].sources
-        left = [c for c in every if any(self._may_be(p, c) for p in c.partners)]
+        every, chosen = self.evidence[key].sources, self.selected
+        families = {p: _family(chosen[p].kind) for c in every for p in c.partners if p in chosen}
+        left = [c for c in every for own in [_family(c.kind)]
+                if any(families.get(p, own) == own for p in c.partners)]  # fmt: skip
         return left or list(every)
-
-    def _may_be(self, partner: Key, source: SourceHypothesis) -> bool:
-        chosen = self.selected.get(partner)
-        return chosen is None or _family(chosen.kind) == _family(source.kind)
 
     def select(self, key: Key, source: SourceHypothesis) -> None:
         """Select a source for ``key``, and for its partners of similar amplitude."""

@@ -119,11 +119,9 @@ def _datx(h5py: Any, content: Any, channel: str | None, what: str) -> MeasuredPo
     no_data = surface.attrs.get("No Data")
     if no_data is not None:
         height[height >= float(np.ravel(no_data)[0])] = np.nan
-    dx, dy = (_pixel(surface, f"{axis} Converter", what) for axis in "XY")
-    # The first row is the upper row of the camera.
-    scaled = np.flipud(height) * _datx_scale(surface, what)
+    pixels = [_pixel(surface, f"{axis} Converter") for axis in "XY"]
     notes = (channel_note(names, chosen),) if len(names) > 1 else ()
-    return HeightGrid(height=scaled, x0=0.0, y0=0.0, dx=dx, dy=dy).points(notes)
+    return _of_pixels(height * _datx_scale(surface, what), pixels, what).points(notes)
 
 
 def _datx_scale(surface: Any, what: str) -> float:
@@ -138,12 +136,10 @@ def _datx_scale(surface: Any, what: str) -> float:
     return float(np.prod([np.ravel(surface.attrs[key])[0] for key in keys]))
 
 
-def _pixel(surface: Any, key: str, what: str) -> float:
-    """Return the distance of pixels [m]: the second number of a converter from pixels."""
+def _pixel(surface: Any, key: str) -> float:
+    """Return the distance of pixels [m]: the second number of a converter from pixels, or NaN."""
     category, base, *_, numbers = np.ravel(surface.attrs[key])[0]
-    if (category, base) != (b"LateralCat", b"Pixels") or not numbers[1] > 0:
-        raise FileError(f"{what} has no lateral calibration; calibrate the camera and save again")
-    return float(numbers[1])
+    return float(numbers[1]) if (category, base) == (b"LateralCat", b"Pixels") else np.nan
 
 
 def write_hdf5(path: Path, columns: Mapping[str, NDArray[np.generic]], comment: str) -> None:
@@ -164,8 +160,6 @@ _HEADER_BYTES = 834
 _LARGEST_HEADER = 65_536
 # Phase values from here on are error codes.
 _NO_DATUM = 2_147_483_640
-# Lines of forty characters for each pixel.
-_LONGEST_ZYGO_TEXT = 40 * int(MAP_POINTS.high)
 # Steps of the phase in one fringe, by the entry "phase resolution".
 _STEPS = {0: 4096, 1: 32768, 2: 131072}
 
@@ -200,7 +194,7 @@ def read_metropro(path: Path) -> MeasuredPoints:
     height, notes = _of_phase(phase, factors, _at(">h", head, 218), what), list[str]()
     if _at(">h", head, 232):
         height, notes = -height, ["its sign entry says 'inverted': the heights were negated"]
-    return _of_pixels(height, _at(">f", head, 184), what).points(tuple(notes))
+    return _of_pixels(height, [_at(">f", head, 184)] * 2, what).points(tuple(notes))
 
 
 def _of_phase(
@@ -213,10 +207,11 @@ def _of_phase(
     return np.where(phase >= _NO_DATUM, np.nan, phase * (float(np.prod(factors)) / steps))
 
 
-def _of_pixels(height: FloatArray, pixel: float, what: str) -> HeightGrid:
-    if not (np.isfinite(pixel) and pixel > 0):
+def _of_pixels(height: FloatArray, sides: Sequence[float], what: str) -> HeightGrid:
+    """Return a map whose first row is the upper row of the camera;  sides: of a pixel [m]."""
+    if not (np.all(np.isfinite(sides)) and min(sides) > 0):
         raise FileError(f"{what} has no lateral calibration; calibrate the camera and save again")
-    return HeightGrid(height=np.flipud(height), x0=0.0, y0=0.0, dx=pixel, dy=pixel)
+    return HeightGrid(height=np.flipud(height), x0=0.0, y0=0.0, dx=sides[0], dy=sides[1])
 
 
 ZYGO_TEXT = (b"Zygo XYZ Data File - Format 1", b"Zygo ASCII Data File - Format 2")
@@ -230,7 +225,8 @@ def read_zygo_text(path: Path) -> MeasuredPoints:
     """
     what = f"Zygo file {str(path)!r}"
     with open_regular(path, FileError, "Zygo file") as stream:
-        text = stream.read(_LONGEST_ZYGO_TEXT).decode("latin-1").replace("\r\n", "\n")
+        raw = stream.read(40 * int(MAP_POINTS.high))  # lines of forty characters for each pixel
+        text = raw.decode("latin-1").replace("\r\n", "\n")
     head, *parts = re.split(r"^# *$", text, flags=re.MULTILINE)
     phases = head.startswith("Zygo ASCII")
     try:
@@ -254,7 +250,7 @@ def read_zygo_text(path: Path) -> MeasuredPoints:
         raise FileError(f"{what} is damaged or was cut short; export it again") from err
     if phases:
         height = _of_phase(height, [*optical[:2], optical[3]], resolution, what)
-    return _of_pixels(height, optical[5], what).points(())
+    return _of_pixels(height, [optical[5]] * 2, what).points(())
 
 
 def _at(form: str, head: bytes, place: int) -> Any:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.form.analyse import optical_terms
+from omsm_ros.core.form.analyse import ZERNIKES, optical_terms
 from omsm_ros.core.form.deviation_map import (
     DeviationMap,
     GridCells,
@@ -20,9 +20,9 @@ from omsm_ros.core.form.part_figures import (
     POWER,
     SYMMETRIC,
     TILT,
+    SmoothTerms,
     rms_of_part,
     without_columns,
-    without_terms,
 )
 from omsm_ros.core.form.texture import UncertainCurve, edge_roll_off, profiles
 from omsm_ros.core.form.zernike_fit import fit_zernikes
@@ -124,11 +124,11 @@ def test_the_rms_of_the_part_is_without_noise_and_without_the_square_of_errors()
 def test_what_is_removed_goes_and_once_is_enough(terms, gone):
     bare = term(5, 5) + term(7, -3)
     spoiled = map_of(bare + sum(term(n, m, 1e-6) for n, m in gone), effects=[term(*gone[-1])])
-    once = without_terms(spoiled, DISC, terms)
-    plain = without_terms(map_of(bare), DISC, terms)
+    once = SmoothTerms.of(spoiled, DISC, terms).without(terms)
+    plain = SmoothTerms.of(map_of(bare), DISC, terms).without(terms)
     np.testing.assert_allclose(once.deviation, plain.deviation, atol=1e-17)
     np.testing.assert_allclose(once.effects, np.zeros((1, 3000)), atol=1e-18)
-    again = without_terms(once, DISC, terms)
+    again = SmoothTerms.of(once, DISC, terms).without(terms)
     np.testing.assert_allclose(again.deviation, once.deviation, atol=1e-18)
 
 
@@ -198,7 +198,9 @@ def test_optical_terms_do_not_know_where_the_part_sits_and_scale_with_it():
     def found(values):
         map_ = map_of(values[few], x=X[few], y=Y[few], area=AREA[few])
         fit = fit_zernikes(map_.x, map_.y, map_.deviation, terms_up_to(6), DISC, weights=map_.area)
-        return {n: f.value for n, f in optical_terms(map_, fit).items()}
+        return {
+            n: f.value for n, f in optical_terms(SmoothTerms.of(map_, DISC, ZERNIKES), fit).items()
+        }
 
     usual = found(error)
     moved = found(7 * (error + term(0, 0, 3e-6) + term(1, 1, 2e-6)))

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.form.analyse import optical_terms
+from omsm_ros.core.form.analyse import ZERNIKES, optical_terms
 from omsm_ros.core.form.deviation_map import DeviationMap
-from omsm_ros.core.form.part_figures import FORM, without_terms
+from omsm_ros.core.form.part_figures import FORM, SmoothTerms
 from omsm_ros.core.form.texture import profiles
 from omsm_ros.core.form.zernike_fit import fit_zernikes
 from omsm_ros.core.surface.aperture import Aperture
@@ -73,7 +73,7 @@ def test_terms_of_the_standard_are_those_of_known_zernikes():
     sizes = {ZernikeIndex(2, 0): 20e-9, ZernikeIndex(4, 0): 10e-9, ZernikeIndex(2, 2): 5e-9}
     map_ = disc_map(sizes, effects=({ZernikeIndex(2, 0): 1e-9},))
     fit = fit_zernikes(map_.x, map_.y, map_.deviation, first_terms(37), DISC, effects=map_.effects)
-    found = optical_terms(map_, fit)
+    found = optical_terms(SmoothTerms.of(map_, DISC, ZERNIKES), fit)
     # Random points are no even disc: their best sphere is 40.002 nm.
     u, v = DISC.scaled(map_.x, map_.y)
     sphere = np.stack([np.ones_like(u), u, v, u**2 + v**2], axis=1)
@@ -102,7 +102,7 @@ def test_the_symmetric_irregularity_is_as_uncertain_as_its_scatter():
         noisy = still.deviation + rng.normal(0, 5e-9, len(still))
         map_ = replace(still, deviation=noisy, noise=5e-9)
         fit = fit_zernikes(map_.x, map_.y, map_.deviation, first_terms(9), DISC)
-        figure = optical_terms(map_, fit)["iso10110_C"]
+        figure = optical_terms(SmoothTerms.of(map_, DISC, ZERNIKES), fit)["iso10110_C"]
         values.append(figure.value)
     assert figure.uncertainty == pytest.approx(np.std(values), rel=0.5)
 
@@ -123,12 +123,12 @@ def test_the_sagitta_of_a_part_of_a_disc_is_that_of_the_sphere_that_fits_it(kind
     sphere = np.stack([np.ones(n), u, v, u**2 + v**2], axis=1)
     expected = abs(np.linalg.lstsq(sphere, map_.deviation, rcond=None)[0][3])
     fit = fit_zernikes(map_.x, map_.y, map_.deviation, first_terms(37), DISC)
-    found = optical_terms(map_, fit)["iso10110_A"]
+    found = optical_terms(SmoothTerms.of(map_, DISC, ZERNIKES), fit)["iso10110_A"]
     assert found.value == pytest.approx(expected, rel=1e-6)
     assert found.uncertainty < 0.5e-9
 
 
 def test_form_goes_and_ripple_stays():
     sizes = {ZernikeIndex(2, 2): 50e-9, ZernikeIndex(3, 1): 15e-9, ZernikeIndex(12, 0): 4e-9}
-    rest = without_terms(disc_map(sizes), DISC, FORM)
+    rest = SmoothTerms.of(disc_map(sizes), DISC, FORM).without(FORM)
     assert np.std(rest.deviation) == pytest.approx(4e-9 / np.sqrt(13), rel=0.03)

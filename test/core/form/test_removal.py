@@ -1,7 +1,7 @@
 import numpy as np
 
 from omsm_ros.core.form.deviation_map import DeviationMap
-from omsm_ros.core.form.part_figures import SECOND_ORDER, best_fit, without_terms
+from omsm_ros.core.form.part_figures import SECOND_ORDER, SmoothTerms, best_fit
 from omsm_ros.core.surface.aperture import Aperture
 
 
@@ -14,7 +14,7 @@ def test_the_second_order_goes_and_nothing_else():
     curved = 1e-6 * (1 + x - 3 * y + 4 * x * x - x * y + 9 * y * y)
     map_ = DeviationMap(x=x, y=y, deviation=rest + curved, area=area,
                         effects=np.stack([curved, rest]), noise=1e-9)  # fmt: skip
-    found = without_terms(map_, Aperture(0.25), SECOND_ORDER)
+    found = SmoothTerms.of(map_, Aperture(0.25), SECOND_ORDER).without(SECOND_ORDER)
     design = np.stack([x**i * y**j for i in range(3) for j in range(3 - i)], axis=1)
     root = np.sqrt(area)
     fitted = np.linalg.lstsq(design * root[:, np.newaxis], rest * root, rcond=None)[0]
@@ -27,7 +27,7 @@ def test_a_profile_has_a_second_order_too():
     x = np.linspace(-1e-2, 1e-2, 500)
     map_ = DeviationMap(x=x, y=0 * x, deviation=1e-9 + 3 * x**2, area=np.ones(500),
                         effects=np.empty((0, 500)), noise=0.0)  # fmt: skip
-    found = without_terms(map_, Aperture(1e-2), SECOND_ORDER)
+    found = SmoothTerms.of(map_, Aperture(1e-2), SECOND_ORDER).without(SECOND_ORDER)
     np.testing.assert_allclose(found.deviation, 0, atol=1e-15)
 
 
