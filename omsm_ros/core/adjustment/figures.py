@@ -29,6 +29,8 @@ POSE = ("piston", "tip", "tilt")
 """What is fitted by default; ``x``, ``y`` and ``clocking`` may be too."""
 # Directions to the rim, where a form of high order has its peaks.
 _RIM = 96
+# Turns from the rim: a spiral that begins there is up to one inside it where it comes round.
+_LAST_TURNS = 1.5
 # Draws: a standard deviation to 4 %.
 _DRAWS = 300
 # Two turns may both lie a quarter of the width of a ring off its middle.
@@ -346,7 +348,7 @@ def _rms(places: Places, shapes: FloatArray) -> float:
 
 
 def places_of(solution: Solution, within: BoolArray | None = None) -> Places:
-    """Return the centre of the blocks of every cell that was scanned, and the outermost blocks.
+    """Return the centre of the blocks of every cell that was scanned, and points of the rim.
 
     within: cells to which they are confined
     """
@@ -361,18 +363,22 @@ def places_of(solution: Solution, within: BoolArray | None = None) -> Places:
     # Towards the rim cells are narrower than blocks: one without a block between two that have
     # some is scanned too, and they stand for half of it each.
     between = np.roll(number > 0, 1) & (number == 0) & np.roll(number > 0, -1)
-    # In each direction the outermost block: terms of high degree are no extrapolation.
+    # In each direction the outermost block; within the last turns on to the rim, where a form of
+    # high order has its peaks. What the terms do between them has its uncertainty.
     u, v = part.disc.scaled(blocks.x, blocks.y)
+    out = np.hypot(u, v)
     # Blocks lie in the middle of a sector of the turn; a quarter off, none is near an end.
     sector = np.floor(np.arctan2(v, u) * (_RIM / (2 * np.pi)) + 0.25) % _RIM
     sector[number[part.cell] == 0] = _RIM
-    outwards = np.lexsort((np.hypot(u, v), sector))
+    outwards = np.lexsort((out, sector))
     rim = outwards[np.flatnonzero(np.diff(sector[outwards], append=_RIM + 1))]
     rim = rim[sector[rim] < _RIM]
+    near = 1 - out[rim] < _LAST_TURNS / (float(np.max(blocks.turn)) + 1)
+    to_rim = np.where(near, 1 / np.maximum(out[rim], 0.5), 1.0)
     weights = (1 + np.roll(between, 1) / 2 + np.roll(between, -1) / 2)[seen]
     return Places(
-        np.append(x, blocks.x[rim]),
-        np.append(y, blocks.y[rim]),
+        np.append(x, part.disc.x + to_rim * (blocks.x[rim] - part.disc.x)),
+        np.append(y, part.disc.y + to_rim * (blocks.y[rim] - part.disc.y)),
         np.append(seen, part.cell[rim]),
         np.append(weights / np.sum(weights), np.zeros(len(rim))),
     )

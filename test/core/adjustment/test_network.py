@@ -185,26 +185,35 @@ def test_cells_are_alike_in_area(small):
 
 
 def test_the_map_reaches_the_peaks_at_the_rim():
-    """A wave of 7 a turn that grows towards the rim, of a spiral with fewer blocks than cells."""
+    """A wave of 7 a turn that grows towards the rim, of a spiral with fewer blocks than cells.
+
+    The spiral begins at the rim, and is a turn inside it where it comes round.
+    """
     solution = spiral_of(42)
     assert 6 * solution.network.part.rings - 3 > SECTORS
     places = places_of(solution)
-    blocks, turned = solution.network.blocks, np.exp(1j * np.arange(0, 2 * np.pi, 0.1))
-    seen, whole = (
-        np.ptp((((one.x + 1j * one.y) / RADIUS_M) ** 7 * turned[:, np.newaxis]).real, axis=1)
-        for one in (places, blocks)
-    )
-    assert np.min(seen / whole) > 0.99
-    # Beyond the blocks terms of high degree would be an extrapolation, off by their whole size.
-    assert set(places.x[places.area == 0]) <= set(blocks.x)
+    wave = ((places.x + 1j * places.y) / RADIUS_M) ** 7
+    turned = np.exp(1j * np.arange(0, 2 * np.pi, 0.1))[:, np.newaxis]
+    assert np.min(np.ptp((wave * turned).real, axis=1)) > 0.997 * 2
+
+
+def test_the_map_ends_with_the_points_where_the_part_does():
+    """An ellipse, whose short ends lie inside the disc by many turns."""
+    solution = spiral_of(42, lambda place: np.hypot(0.7 * place.real, place.imag) < 0.7 * RADIUS_M)
+    places, blocks = places_of(solution), solution.network.blocks
+    rim = places.area == 0
+    assert np.max(np.abs(places.y)) == pytest.approx(np.max(np.abs(blocks.y)))
+    beyond = np.hypot(places.x[rim], places.y[rim] / 0.7) - RADIUS_M
+    assert np.max(beyond) < 1.5 * RADIUS_M / 42
 
 
 def spiral_of(turns, seen=lambda place: np.full(len(place), True)):
     """Return a solution that knows where the blocks of a spiral inwards are, and no more."""
     share = np.arange(turns * SECTORS + 1) / SECTORS
     place = RADIUS_M * (1 - share / turns) * np.exp(2j * np.pi * share)
-    place = place[seen(place)]
-    blocks = SimpleNamespace(x=place.real, y=place.imag)
+    kept = seen(place)
+    place, turn = place[kept], np.floor(share[kept])
+    blocks = SimpleNamespace(x=place.real, y=place.imag, turn=turn)
     return SimpleNamespace(network=SimpleNamespace(blocks=blocks, part=part_model(blocks, turns)))
 
 
