@@ -148,6 +148,8 @@ def _columns(
     before = (count[:, np.newaxis] * share).astype(np.int64)
     after = count[:, np.newaxis].astype(np.int64) - 1 - before
     nodes = begins[:, np.newaxis] + np.concatenate([before, after], axis=1)
+    if np.all(count == 1):  # of a plan
+        nodes = nodes[:, :1]
     made = np.empty((len(begins), sum(f.size for f in families)))
     for first in range(0, len(begins), _CHUNK):
         here = nodes[first : first + _CHUNK]

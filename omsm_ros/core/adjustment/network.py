@@ -417,9 +417,12 @@ def estimate_scales(solution: Solution) -> Scales:
     share = net.cell_share(net.weights(scales), scales)
     seen = np.unique(net.part.cell)
     determined_cells = float(np.sum(1 - share[seen] / max(scales.cells, _LEAST_VARIANCE)))
+    walked = [(scales.walk * np.sum(moves**2), np.sum(1 - np.diag(covariance)))
+              for moves, covariance in _moves(solution)]  # fmt: skip
+    square, number = (float(total) for total in np.sum(walked, axis=0))
     return replace(
         scales,
-        walk=_variance(*_walk_squares(solution), scales.walk, least),
+        walk=_variance(square, number, scales.walk, least),
         bands=bands,
         cells=_variance(float(np.sum(cells**2)), determined_cells, scales.cells, least),
         noise=_noise(solution, residual - cells[net.part.cell], determined_cells),
@@ -435,15 +438,6 @@ _LARGEST_STEP, _VANISHED = 30.0, 1e-5
 def _variance(square: float, determined: float, before: float, least: float) -> float:
     found = square / max(determined, 1e-3)
     return float(max(np.clip(found, before / _LARGEST_STEP, before * _LARGEST_STEP), least))
-
-
-def _walk_squares(solution: Solution) -> tuple[float, float]:
-    """Return the sum of squares of the drift's moves [m²/s], and how many the data determine."""
-    square, determined = 0.0, 0.0
-    for moves, covariance in _moves(solution):
-        square += float(np.sum(moves**2)) * solution.scales.walk
-        determined += float(np.sum(1 - np.diag(covariance)))
-    return square, determined
 
 
 def _moves(solution: Solution) -> Iterator[tuple[FloatArray, FloatArray]]:

@@ -120,8 +120,8 @@ class ScanView:
 
     time: since the first scan began [s];  since: since this scan began [s]
     x, y: in the part frame [m];  slide_x, slide_y: from the spindle axis, machine frame [m]
-    turned: spindle angle plus clocking, from the machine frame to the part frame [rad]
     x_rate, y_rate: of the path over the part [m/s];  slope_x, slope_y: of the surface, part frame
+    machine_slope_x, machine_slope_y: of the surface, machine frame
     motion, motion_rate, motion_acceleration: of Z [m], [m/s], [m/s²]
     motion_play: 1 upwards, −1 downwards, or by an assumed backlash: see :func:`play`
     motion_fading: mean of the motion over the last seconds less the motion: creep [m], (n, 2)
@@ -137,11 +137,12 @@ class ScanView:
     slide_x: FloatArray
     slide_y: FloatArray
     c: FloatArray
-    turned: FloatArray
     x_rate: FloatArray
     y_rate: FloatArray
     slope_x: FloatArray
     slope_y: FloatArray
+    machine_slope_x: FloatArray
+    machine_slope_y: FloatArray
     motion: FloatArray
     motion_rate: FloatArray
     motion_acceleration: FloatArray
@@ -171,8 +172,7 @@ class ScanView:
 
     def across(self, x: FloatArray | float, y: FloatArray | float) -> FloatArray:
         """Return the height error of points reported off by ``x``, ``y`` [m] of the machine."""
-        one = np.ones(len(self))
-        return self.lateral_error(*workpiece_xy(x * one, y * one, self.turned))
+        return np.asarray(-self.machine_slope_x * x - self.machine_slope_y * y, np.float64)
 
 
 class Zero(NamedTuple):
@@ -201,7 +201,8 @@ def view_of(scan: ScanData, index: int, zero: Zero, nominal: Surface) -> ScanVie
     x, y = workpiece_xy(scan.x, scan.y, np.full(len(scan), scan.clocking))
     slide_x, slide_y = workpiece_xy(scan.x, scan.y, -scan.c)
     x_rate, y_rate = (_rate(scan.time, v) for v in (x, y))
-    slope_x, slope_y = slopes_by_differences(nominal, x, y)
+    slopes = slopes_by_differences(nominal, x, y)
+    in_machine = workpiece_xy(*slopes, -(scan.c + scan.clocking))
     deviation = scan.height - zero.height - nominal.height(x, y)
     # Creep: the mean of the motion over the last seconds, fading, less the motion.
     motion_rate = _rate(scan.time, scan.motion)
@@ -216,11 +217,12 @@ def view_of(scan: ScanData, index: int, zero: Zero, nominal: Surface) -> ScanVie
         slide_x=slide_x,
         slide_y=slide_y,
         c=scan.c,
-        turned=scan.c + scan.clocking,
         x_rate=x_rate,
         y_rate=y_rate,
-        slope_x=slope_x,
-        slope_y=slope_y,
+        slope_x=slopes[0],
+        slope_y=slopes[1],
+        machine_slope_x=in_machine[0],
+        machine_slope_y=in_machine[1],
         motion=scan.motion - zero.motion,
         motion_rate=motion_rate,
         motion_play=np.sign(motion_rate),

@@ -183,9 +183,7 @@ def _inseparable(kind: str, view: ScanView, turns: float) -> FloatArray:
         nodes = np.linspace(place.min(), place.max(), _HATS)
         return np.stack([time, *(np.interp(place, nodes, hat) for hat in np.eye(_HATS))])
     if kind == STAND_OFFS and turns > 2 and np.ptp(view.distance) > 1e-6:
-        waves = [
-            f(n * view.turned) for n in range(1, _RING_HARMONICS + 1) for f in (np.cos, np.sin)
-        ]
+        waves = [f(n * view.c) for n in range(1, _RING_HARMONICS + 1) for f in (np.cos, np.sin)]
         return np.stack([time, one, *waves])
     if kind == TURNED and turns > 2 and np.ptp(radius) > 0.5 * radius.max():
         terms = terms_up_to(_ZERNIKE_DEGREE)

@@ -160,8 +160,8 @@ def _resampled(
         dofs=tuple(moved),
         moved={**moved},
         refused={},
-        from_a=_heights_at(here, filled),
-        from_b=_heights_at(there, filled),
+        from_a=LocalHeights(*(values[filled] for values in here)),
+        from_b=LocalHeights(*(values[filled] for values in there)),
         b_x=u[filled],
         b_y=v[filled],
     )
@@ -214,7 +214,3 @@ def _independent_part(column: FloatArray, others: Sequence[FloatArray]) -> Float
         return column
     design = np.stack(others, axis=1)
     return np.asarray(column - design @ least_squares(design, column, _SINGULAR))
-
-
-def _heights_at(heights: LocalHeights, place: BoolArray) -> LocalHeights:
-    return LocalHeights(*(getattr(heights, name)[place] for name in LocalHeights.__slots__))

@@ -8,6 +8,7 @@ shorter than the radius are averaged out. Places that the cells do not surround 
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -143,8 +144,7 @@ def portions(count: int) -> Iterator[slice]:
 Rows = Callable[[int, int], FloatArray]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LocalHeights:
+class LocalHeights(NamedTuple):
     """Heights at places (m,), NaN where the points do not surround a place.
 
     value: [m];  slope_x, slope_y: [1];  density: points in a cell there, harmonic mean
@@ -216,15 +216,12 @@ class LocalQuadratic:
 
     def _means(self, rows: Rows) -> FloatArray:
         """Return the mean of each row over the points of each cell, (s, k)."""
-        sums: FloatArray | None = None
+        cells, sums = len(self._cells.x), np.zeros(1)
         for p in portions(len(self._cell)):
             cell = self._cell[p]
-            part = rows(p.start, len(cell))
-            if sums is None:
-                sums = np.zeros((len(part), len(self._cells.x)))
-            for total, values in zip(sums, part, strict=True):
-                total += np.bincount(cell, values, len(total))
-        return np.empty((0, 0)) if sums is None else sums / self._cells.points
+            part = [np.bincount(cell, values, cells) for values in rows(p.start, len(cell))]
+            sums = sums + np.reshape(part, (-1, cells))
+        return sums / self._cells.points
 
     def method_error(self, x: FloatArray, y: FloatArray) -> float:
         """Return an upper bound of the rms interpolation error at places like x, y (m,) [m].

@@ -7,6 +7,7 @@ are not declared are reported as not evaluated.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -88,15 +89,10 @@ def highest_factor(
     """
     from scipy.optimize import brentq
 
-    known: dict[float, float] = {}
-
+    @cache  # both ends are asked for twice
     def excess(logarithm: float) -> float:
-        if logarithm not in known:
-            value = (
-                now if logarithm == 0 and now is not None else value_at(float(np.exp(logarithm)))
-            )
-            known[logarithm] = float(np.log(max(value / allowed, _TINY)))
-        return known[logarithm]
+        value = now if logarithm == 0 and now is not None else value_at(float(np.exp(logarithm)))
+        return float(np.log(max(value / allowed, _TINY)))
 
     end = float(np.log(FASTEST))
     low, high = (0.0, end) if excess(0.0) <= 0 else (-end, 0.0)
@@ -104,8 +100,8 @@ def highest_factor(
         return FASTEST
     if excess(low) > 0:
         return 0.0
-    brentq(excess, low, high, xtol=_PRECISION / 2)
-    return float(np.exp(max(place for place, over in known.items() if over <= 0)))
+    # The root is off by the precision at most.
+    return float(np.exp(max(brentq(excess, low, high, xtol=_PRECISION / 2) - _PRECISION / 2, low)))
 
 
 def speed_limits(
