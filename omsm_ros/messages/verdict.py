@@ -29,8 +29,8 @@ verdict.not_redundant: one speed and direction cannot show an error of the dynam
 verdict.not_evaluated: not evaluated, and not shown by these scans: {names} (may change the heights
     by {value:m/2}); {remedy}{declare}
 verdict.declare: , or declare {names} with its evaluation
-verdict.declared_only: declared without an evaluation, and not shown by these scans: {names} (may
-    change the heights by {value:m/2}); {remedy}, or state the recording, command or report that
+verdict.declared_only: declared without an evaluation, and not shown by these scans: {names} (PV may
+    be off by {value:m/2}, k = 2); {remedy}, or state the recording, command or report that
     evaluates it
 verdict.looks_like: the form ({value:m/2} rms of it) looks like {names}, which these scans cannot
     tell from the part; {remedy}, or accept it as the form of the part with omsm adjust --accept

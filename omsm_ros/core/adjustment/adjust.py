@@ -208,7 +208,7 @@ def adjust(
     reasons = reasons_of(refutations, stated, agreement, wrong, walk, accepted, least)
     verdict = verdict_of(
         _or_sense_of_c(reasons, scans, priors, surface, refutations),
-        not_evaluated(families, effects, priors, open_limit(accuracy))
+        not_evaluated(families, effects, priors, accuracy)
         + looks_like(form.resembled, families, accepted, open_limit(accuracy)),
         rests_on(families, effects, form.mean_uncertainty, _mirrored(scans, surface, form)),
         enough, 2 * form.pv.uncertainty, accuracy,

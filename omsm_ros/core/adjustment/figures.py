@@ -147,7 +147,7 @@ class Effect(NamedTuple):
     """Possible effect of a family on the form, rms over the part, k = 1 [m].
 
     left: by what scans and prior leave open;  free: by what the scans alone leave open if the prior
-        is worth nothing, and the family may have its size ``wide``
+        is worth nothing, and the family may have its size ``wide``;  peak: of that, PV [m]
     shape: change of the map by the size ``wide`` of each parameter (n, size) [m]
     known: information that the scans have of the parameters over ``wide``, whatever form the part
         has (size, size)
@@ -155,11 +155,12 @@ class Effect(NamedTuple):
 
     left: float
     free: float
+    peak: float
     shape: FloatArray
     known: FloatArray
 
 
-NO_EFFECT = Effect(0.0, 0.0, np.zeros((0, 0)), np.zeros((0, 0)))
+NO_EFFECT = Effect(0.0, 0.0, 0.0, np.zeros((0, 0)), np.zeros((0, 0)))
 
 
 def effects_on_form(made: FormOf) -> dict[str, Effect]:
@@ -179,11 +180,12 @@ def effects_on_form(made: FormOf) -> dict[str, Effect]:
         change = through[:, here] @ np.linalg.pinv(covariance, rcond=1e-10)
         share, axes = np.linalg.eigh(covariance)
         left = _rms(made.places, change @ (axes * np.sqrt(np.maximum(share, 0.0))))
-        free = _rms(made.places, change @ evidence_of(solution, family).free)
+        open_changes = change @ evidence_of(solution, family).free
+        free, peak = _rms(made.places, open_changes), float(np.linalg.norm(_pv(open_changes)))
         root = evidence_of(any_part, family).free
         # Without the plausible size itself: (root rootᵀ)⁻¹ = information + wide⁻².
         known = family.wide**2 * np.linalg.pinv(root @ root.T, rcond=1e-10) - np.eye(family.size)
-        found[family.name] = Effect(left, max(left, free), family.wide * change, known)
+        found[family.name] = Effect(left, max(left, free), peak, family.wide * change, known)
     return found
 
 

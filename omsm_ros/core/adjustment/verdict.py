@@ -147,8 +147,8 @@ def _named(causes: Sequence[Refutation], declared: Collection[str], least: float
 
 # Of the accuracy: what a source that is neither shown nor declared may do to the heights.
 _OPEN_SHARE = 0.5
-# Where no accuracy is asked for, what matters to a mirror for visible light [m].
-_OPEN_M = 20e-9
+# Where no accuracy is asked for, what matters to a mirror for visible light: rms and PV [m].
+_OPEN_M, _OPEN_PV_M = 20e-9, 80e-9
 
 
 def open_limit(accuracy: float | None) -> float:
@@ -160,26 +160,32 @@ def not_evaluated(
     families: Sequence[Family],
     effects: Mapping[str, Effect],
     priors: Sequence[Source],
-    limit: float,
+    accuracy: float | None,
 ) -> tuple[Reason, ...]:
     """Return families that nobody evaluated, that these scans leave open, and that may matter.
 
     effects: of each family on the form, left by scans and prior and by the scans alone, k = 1 [m]
-    limit: effect from which on a source matters [m]
+    accuracy: of PV, asked for [m]; None: none
 
+    What nobody declared counts in the uncertainty with the probability that it is there, so that
+    its heights matter from :func:`open_limit` on. What is declared counts with its declaration:
+    without an evaluation it must not hold where PV (k = 2) could be off by the accuracy.
     The second name of a reason is the scan or artefact that would show the family.
     """
     stated = {base_name(p.name): p for p in priors}
+    limit, of_pv = open_limit(accuracy), _OPEN_PV_M if accuracy is None else accuracy
     found = []
     for family in families:
-        prior = stated.get(base_name(family.name))
+        prior, effect = stated.get(base_name(family.name)), effects.get(family.name, NO_EFFECT)
+        names = (family.name, family.shown_by)
+        size = np.inf if prior is None else prior.uncertainty
         # A default is wide enough for good machines, and what it leaves open is in the uncertainty.
-        if not family.named or family.default is not None or (prior and prior.evaluated):
+        if (family.default is not None and size >= family.default) or (prior and prior.evaluated):
             continue
-        free = effects.get(family.name, NO_EFFECT).free
-        if free > limit:
-            code = NOT_EVALUATED if prior is None else DECLARED_ONLY
-            found.append(Reason(code, (family.name, family.shown_by), free, limit))
+        if prior and 2 * effect.peak > of_pv:
+            found.append(Reason(DECLARED_ONLY, names, 2 * effect.peak, of_pv))
+        elif prior is None and family.named and effect.free > limit:
+            found.append(Reason(NOT_EVALUATED, names, effect.free, limit))
     return tuple(found)
 
 

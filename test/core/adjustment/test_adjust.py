@@ -35,7 +35,7 @@ def table():
         machine.scan(60, outward=True),
         machine.scan(30, clocking=np.deg2rad(80)),
     ]
-    exact = (Source("part_shift", 1e-9), Source("part_turn", 1e-8))
+    exact = [Source(*p, evaluated=True) for p in (("part_shift", 1e-9), ("part_turn", 1e-8))]
     priors = [p for p in PRIORS if p.name not in ("part_shift", "part_turn")]
     # Two scans to the centre leave it open.
     priors += [*exact, Source("expansion", 2e-7, evaluated=True)]
@@ -178,6 +178,19 @@ def test_what_is_only_declared_does_not_turn_green(table):
     names = {r.names[0]: r for r in found.verdict.reasons if r.names}
     assert names["straightness_x"].code == "declared_only"
     assert names["straightness_x"].names[1] == "reference_artefact"
+
+
+@pytest.mark.parametrize("name", ["clocking", "expansion", "straightness_z"])
+def test_one_declaration_without_evaluation_is_enough(table, name):
+    """A pose, a size below the default, and a source that may change PV by more than the rms."""
+    _, scans, _ = table
+    sizes = {p.name: p for p in (*PRIORS, Source("expansion", 2e-7, evaluated=True))}
+    stated = (sizes | {name: replace(sizes[name], evaluated=False)}).values()
+    found = adjust(scans[:2], list(stated), nominal=MIRROR, accuracy=40e-9)
+    assert found.verdict.code == NOT_VERIFIED
+    (reason,) = found.verdict.reasons
+    assert (reason.code, reason.names[0]) == ("declared_only", name)
+    assert reason.value > reason.limit == 40e-9
 
 
 @pytest.mark.soak
