@@ -18,7 +18,8 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy import fft, signal
 
-from omsm_ros.core.estimation.output_error import Fit, Problem
+from omsm_ros.core.estimation.model_structure import Fit
+from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.estimation.steps import Steps
 from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
@@ -50,11 +51,21 @@ def through_backlash(motion: FloatArray, half: float) -> FloatArray:
 
 def _driven(motion: FloatArray, half: float, turned: FloatArray, turns: IntArray) -> FloatArray:
     """Return the output (n,) of a gap; ``motion`` turns at values ``turned`` (r,), ``turns``."""
-    state, states = float(motion[0]), []
-    for end in turned.tolist():
-        states.append(state)
-        state = min(max(state, end - half), end + half)
-    held = np.repeat(states, np.diff(turns, prepend=-1))
+    # A turn clips the state to a range, and clips after one another are a clip: those of each block
+    # are combined, all blocks at once.
+    size = int(np.sqrt(len(turned))) + 1
+    ends = np.resize(turned, (-(-len(turned) // size), size))
+    low, high = ends - half, ends + half
+    for k in range(1, size):
+        for bound in (low, high):
+            np.clip(bound[:, k - 1], ends[:, k] - half, ends[:, k] + half, out=bound[:, k])
+    state, states = float(motion[0]), np.empty(ends.shape)
+    for row, last_low, last_high in zip(
+        states, low[:, -1].tolist(), high[:, -1].tolist(), strict=True
+    ):
+        row[0], state = state, min(max(state, last_low), last_high)
+    np.clip(states[:, :1], low[:, :-1], high[:, :-1], out=states[:, 1:])
+    held = np.repeat(states.ravel()[: len(turned)], np.diff(turns, prepend=-1))
     near = motion - half
     np.maximum(held, near, out=held)
     near += 2 * half
@@ -136,12 +147,7 @@ class ModelErrorFamily:
     ) -> ModelErrorFamily:
         """Return the terms whose ``columns`` (n, terms · c) are known."""
         width = int(columns.shape[1] // len(parameters))
-
-        def part(first: int, last: int) -> FloatArray:
-            # A copy, because a view would keep the whole family in memory.
-            return columns.T[first * width : last * width].copy().T
-
-        return cls(name, parameters, trials, part, width)
+        return cls(name, parameters, trials, lambda a, b: columns[:, a * width : b * width], width)
 
     def term(self, index: int) -> ModelErrorTerm:
         """Return the term at ``index``."""
