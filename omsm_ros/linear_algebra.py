@@ -57,18 +57,6 @@ def inverse_gram(gram: FloatArray) -> FloatArray:
     return np.asarray(root @ root.T)
 
 
-def triangle(*parts: FloatArray) -> FloatArray:
-    """Return R (q, q) of the columns of all ``parts`` (n, …), side by side, without making Q.
-
-    Block by block, so that a long record's columns are never in memory twice.
-    """
-    found = np.zeros((0, sum(part.shape[1] for part in parts)))
-    for first in range(0, len(parts[0]), BLOCK_ROWS):
-        block = np.column_stack([part[first : first + BLOCK_ROWS] for part in parts])
-        found = np.asarray(np.linalg.qr(np.concatenate([found, block]), mode="r"))
-    return found
-
-
 class _OneThread(ContextDecorator):
     """The limit of BLAS to one thread, shared by all that ask for it at the same time."""
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.linear_algebra import least_squares, orthonormal, triangle, unit_columns
+from omsm_ros.linear_algebra import least_squares, orthonormal, unit_columns
 
 RANDOM = np.random.default_rng(1)
 COLUMNS = RANDOM.normal(size=(50, 3)) * [1e-9, 1.0, 1e12]
@@ -40,13 +40,3 @@ def test_a_direction_below_the_tolerance_is_left_out():
     assert basis.T @ basis == pytest.approx(np.eye(3), abs=1e-12)
     column = COLUMNS[:, 0] * 1e9
     assert basis @ (basis.T @ column) == pytest.approx(column, abs=1e-12)
-
-
-def test_a_triangle_of_blocks_has_the_products_of_the_columns(monkeypatch):
-    monkeypatch.setattr("omsm_ros.linear_algebra.BLOCK_ROWS", 7)
-    one, other = np.random.default_rng(3).normal(size=(2, 40, 3))
-    found = triangle(one, other)
-    columns = np.column_stack([one, other])
-    assert found.shape == (6, 6)
-    np.testing.assert_allclose(found, np.triu(found))
-    np.testing.assert_allclose(found.T @ found, columns.T @ columns, atol=1e-12)

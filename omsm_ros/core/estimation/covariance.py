@@ -3,8 +3,9 @@
 import numpy as np
 from scipy import fft, linalg, ndimage
 
+from omsm_ros.core.estimation.model_structure import Fit
 from omsm_ros.core.estimation.noise import RandomWalk, scatter_in_time, uneven_rows, with_walk
-from omsm_ros.core.estimation.output_error import Fit, Problem
+from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.linear_algebra import BLOCK_VALUES, orthonormal

@@ -6,29 +6,28 @@ with one parameter more: it trades that bias for variance, which the uncertainty
 Alternatives that changed nothing are in ``docs/design/identification-ablation.md``.
 
 A fit starts at several points, because the output error has local minima: at the best fit of a
-smaller structure, so that a larger one never fits worse; at the result of iterated linear least
-squares, which finds resonances; and at a simple guess, for readings too coarse for these.
+smaller structure, so that a larger one never fits worse; and at the result of iterated linear least
+squares, which finds resonances.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy import signal
 
-from omsm_ros.core.estimation.model_structure import ScaledStructure
-from omsm_ros.core.estimation.optimisation import EvaluationBudget
-from omsm_ros.core.estimation.output_error import Fit, Problem
+from omsm_ros.core.estimation.model_structure import Fit, ScaledStructure
+from omsm_ros.core.estimation.optimisation import CONVERGED, EvaluationBudget, Projection, descend
+from omsm_ros.core.estimation.output_error import CompressedProblem, Problem
 from omsm_ros.core.lti.transfer_function import (
     ComplexArray,
     Structure,
     TransferFunction,
     ascending_roots,
 )
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import IdentificationError
 from omsm_ros.linear_algebra import least_squares
 
@@ -165,18 +164,69 @@ def cancels(dynamics: TransferFunction) -> bool:
     return bool(np.any(apart < _CANCELLING * np.abs(poles[:, np.newaxis])))
 
 
-# Guess of the slowest pole, in units of the bandwidth of the motion.
-_GUESSED_RATE = 3.0
-# Its angle from the positive real axis [rad]: a damping ratio of 0.42.
-_GUESSED_ANGLE = 2.0
+# Iterations from each start; held inputs need five (docs/design/identification-ablation.md).
+_RACE_EVALUATIONS = 5
+# Most iterations from the best start: it bounds fits along a flat valley, others converge.
+_FINISH_EVALUATIONS = 60
+# Most times that what is not compared is filled in anew; where it is a tenth, some need thirty.
+_REFILLED = 40
+
+
+def fit(
+    problem: Problem,
+    structure: Structure,
+    starts: Sequence[FloatArray],
+    evaluations: int = _FINISH_EVALUATIONS,
+    *,
+    budget: EvaluationBudget | None = None,
+    part: CompressedProblem | None = None,
+) -> Fit:
+    """Improve each of ``starts``, ψ, by a few evaluations; return the minimum of the best of them.
+
+    evaluations: most iterations to that minimum
+    budget: counts the evaluations, if given
+    part: the problem compressed, where the minimum is to be known to a fraction of the noise only
+    """
+    scaled = ScaledStructure(structure, problem.rate)
+    box, lines = problem.box(scaled), part or problem.lines
+    # Where the minimum is explored only, a part of what noise changes by chance is nothing.
+    size, least_gain = (len(part.target), 1.0) if part else (len(problem.target), CONVERGED)
+    now: Problem | CompressedProblem = lines or problem
+
+    def project(nonlinear: FloatArray) -> Projection:
+        if budget is not None:
+            budget.count(size, structure.poles)
+        return now.project(scaled, nonlinear)
+
+    def compared(at: Projection) -> Fit:
+        found = problem.fit_at(scaled, at)
+        return found if lines is None else problem.compared(found)
+
+    raced = []
+    for start in starts:
+        now = lines or problem
+        at = project(np.clip(start, *box))
+        if lines is not None and part is None:
+            now = lines.filled(compared(at))
+            at = project(at.nonlinear)
+        raced.append(compared(descend(project, at, box, _RACE_EVALUATIONS)))
+    best = min(raced, key=lambda found: found.sum_of_squares)
+    for _ in range(_REFILLED):
+        now = problem if lines is None else lines.filled(best)
+        found = compared(descend(project, project(best.nonlinear), box, evaluations))
+        gain, best = best.sum_of_squares - found.sum_of_squares, found
+        if lines is None or gain * best.samples < least_gain * best.sum_of_squares:
+            break
+        evaluations = _RACE_EVALUATIONS
+    return best if lines is None or part else problem.evaluated(structure, best.nonlinear)
+
+
 # Part of the lag that starts as a delay where there are poles too.
 _KEPT_DELAY = 0.3
 # Iterations after Sanathanan and Koerner (1963): by then they have converged, or will not.
 _LINEAR_ITERATIONS = 8
 # Start of an added pole: fast enough to change little, slow enough to have a gradient.
 _ADDED_POLE = -10.0
-# Slow model errors thin records of twice as many samples; a step test at 1 kHz has 20 000.
-ENOUGH_SAMPLES = 20_000
 # Half the sampling rate of a decimated problem over the bandwidth of the motion.
 ABOVE_CONTENT = 1.25
 # Anti-alias filter: taps on either side at the new rate, the middle of its edge over half the new
@@ -191,7 +241,7 @@ class StartingPoints:
     pure_delay: the fit of a delay alone
     """
 
-    problem: Problem
+    problem: Problem | CompressedProblem
     pure_delay: Fit
 
     def of(self, structure: Structure, smaller: Sequence[Fit]) -> list[FloatArray]:
@@ -201,25 +251,18 @@ class StartingPoints:
         if structure.poles == 0:
             return [self.pure_delay.nonlinear]
         kept = _KEPT_DELAY * delay if structure.delay else 0.0
-        found = [_guess(scaled, kept), scaled.nonlinear_of(self._linear(structure, kept), kept)]
+        found = [scaled.nonlinear_of(self._linear(structure, kept), kept)]
         contained = [f for f in smaller if structure.contains(f.structure)]
         if contained:
             found.append(_grown(scaled, min(contained, key=lambda f: f.sum_of_squares), delay))
         return found
 
-    @cached_property
-    def _probe(self) -> ComplexArray:
-        """Spectrum of the output without background; lost samples are replaced by the motion."""
-        problem, lag = self.problem, self.pure_delay
-        output = problem.output - problem.background @ lag.background
-        filled = np.where(problem.used, output, lag.gain * problem.input)
-        return problem.closed_spectrum(np.asarray(filled))
-
     def _linear(self, structure: Structure, delay: float) -> ComplexArray:
         """Return the poles (n,) by iterated linear least squares (Sanathanan and Koerner 1963)."""
         # The line at s = 0 determines the background only; at both ends s may be extreme.
         inside = slice(1, max(len(self.problem.s) - 1, 2))
-        s, probe = self.problem.s[inside, np.newaxis], self._probe[inside]
+        s = self.problem.s[inside, np.newaxis]
+        probe = self.problem.without_background(self.pure_delay)[inside]
         powers = np.vander(s[:, 0], structure.poles + 1, increasing=True)
         downs = -powers[:, 1:] * probe[:, np.newaxis]
         ups = [
@@ -250,7 +293,8 @@ def coarser(problem: Problem, every: int) -> Problem:
     """
     index = np.arange(len(problem.used))
     output = np.interp(index, index[problem.used], problem.output[problem.used])
-
+    # A sample counts that a reading is near to.
+    near = np.pad(problem.used, (every // 2, 0), "edge")[: len(index)]
     # A lightly damped mode beyond half the new rate would be aliased.
     low_pass = signal.firwin(
         2 * _HALF_TAPS * every + 1, _PASSES / every, window=("kaiser", _STOPPING_SHAPE)
@@ -265,7 +309,7 @@ def coarser(problem: Problem, every: int) -> Problem:
         further=np.array([thinned(motion) for motion in problem.further]),
         starts=tuple(start // every for start in problem.starts),
         output=thinned(output),
-        used=_bridged(problem.used, every),
+        used=np.logical_or.reduceat(near, np.arange(0, len(index), every)),
         period=problem.period * every,
         background=np.column_stack([thinned(column) for column in problem.background.T]),
         noise=problem.noise / np.sqrt(every),
@@ -274,30 +318,6 @@ def coarser(problem: Problem, every: int) -> Problem:
         errors_in_variables=None,
         recorded=None,
     )
-
-
-def _bridged(used: BoolArray, every: int) -> BoolArray:
-    """Return True for those of one in ``every`` samples that are used or well interpolated.
-
-    A gap is well interpolated if it is no longer than a new sample, or than the usual distance of
-    readings: where every second sample holds a reading, all picked samples may lie between them.
-    """
-    picked, places = np.arange(0, len(used), every), np.flatnonzero(used)
-    apart = np.diff(places)
-    after = np.searchsorted(places, picked)
-    inside = (after > 0) & (after < len(places))
-    short = apart <= max(every, int(np.median(apart)))
-    return np.asarray(used[picked] | (inside & short[np.where(inside, after - 1, 0)]))
-
-
-def _guess(scaled: ScaledStructure, delay: float) -> FloatArray:
-    poles: list[complex] = []
-    for index in range(scaled.structure.pairs):
-        upper = complex((index + 1) * _GUESSED_RATE * np.exp(1j * _GUESSED_ANGLE))
-        poles += [upper, upper.conjugate()]
-    if scaled.structure.poles % 2:
-        poles.append(complex(-2.0 * _GUESSED_RATE))
-    return scaled.nonlinear_of(np.array(poles, np.complex128), delay)
 
 
 def _stable(poles: ComplexArray) -> ComplexArray:

@@ -59,7 +59,7 @@ class ScaledStructure:
         """Return L = e^{-τs} / denominator at scaled ``s`` (k,), (k,)."""
         denominator = np.ones_like(s)
         for section in self.sections(nonlinear):
-            denominator = denominator * polynomial.polyval(s, section)
+            denominator *= _section_at(section, s)
         if not self.structure.delay:
             return np.asarray(1 / denominator)
         return np.asarray(np.exp(-self._delay(nonlinear) * s) / denominator)
@@ -68,7 +68,7 @@ class ScaledStructure:
         """Return d ln L / dψ (len ψ, k) at scaled ``s`` (k,), see :meth:`lag`."""
         first, second = [], []
         for section in self.sections(nonlinear):
-            value = polynomial.polyval(s, section)
+            value = _section_at(section, s)
             if len(section) == 3:
                 second.append(-section[2] * s * s / value)
             first.append(-section[1] * s / value)
@@ -118,3 +118,64 @@ class ScaledStructure:
         logs = np.log(np.concatenate([firsts, [second for _, second in sections]]))
         tail = [delay] if self.structure.delay else []
         return np.concatenate([np.clip(logs, -_LOG_RANGE, _LOG_RANGE), tail])
+
+
+def _section_at(section: FloatArray, s: ComplexArray) -> ComplexArray:
+    """Return 1 + d1 s + d2 s² at ``s`` (k,); a general polynomial takes longer."""
+    last = s * section[-1]
+    return np.asarray(1.0 + (last if len(section) == 2 else s * (section[1] + last)))
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted structure.
+
+    nonlinear: ψ;  driven: coefficients of the driven terms, scaled, those of the numerator first
+    background: coefficients (q,);  residual: (k,) [m]
+    """
+
+    scaled: ScaledStructure
+    nonlinear: FloatArray
+    driven: FloatArray
+    background: FloatArray
+    residual: FloatArray
+
+    @property
+    def structure(self) -> Structure:
+        """Poles, zeros and delay that were fitted."""
+        return self.scaled.structure
+
+    @property
+    def gain(self) -> float:
+        """Static gain, motion of the probe per motion of the axis."""
+        return float(self.driven[0])
+
+    @property
+    def numerator(self) -> FloatArray:
+        """Scaled numerator (m+1,), numerator[0] = 1."""
+        return np.asarray(self.driven[: self.structure.zeros + 1] / self.driven[0])
+
+    @property
+    def size(self) -> int:
+        """Number of free parameters: of the structure, and of further drives."""
+        return self.structure.size + len(self.driven) - len(self.numerator)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples compared."""
+        return len(self.residual)
+
+    @property
+    def sum_of_squares(self) -> float:
+        """Sum of the squared residual [m²]."""
+        return float(self.residual @ self.residual)
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residual [m]."""
+        return float(np.sqrt(self.sum_of_squares / self.samples))
+
+    @property
+    def dynamics(self) -> TransferFunction:
+        """G(s) with G(0) = 1."""
+        return self.scaled.transfer_function(self.nonlinear, self.numerator)

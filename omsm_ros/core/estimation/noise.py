@@ -27,7 +27,8 @@ from math import comb
 import numpy as np
 from scipy import fft
 
-from omsm_ros.core.estimation.output_error import Fit, Problem
+from omsm_ros.core.estimation.model_structure import Fit
+from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.estimation.steps import Edge, Steps
 from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray

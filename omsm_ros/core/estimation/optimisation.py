@@ -18,31 +18,23 @@ _SMALLEST_STEP = 1e-9
 # In ψ, the logarithm of a coefficient: a factor of 20, beyond which no quadratic model holds.
 _LONGEST_STEP = 3.0
 # Part of the decrease of χ² that one parameter makes by chance.
-_CONVERGED = 1e-4
+CONVERGED = 1e-4
 # All accepted of 270 disturbed step tests needed at most 1200 evaluations before their last round,
-# half of them fewer than 250; 1500 of 20 s at 1 kHz take five to eight seconds.
-_MOST_EVALUATIONS = 1500
-# As much work as 1500 evaluations of 20 s at 1 kHz, and 300 with all samples of a long record,
-# most of whose evaluations use fewer samples.
-_MOST_SAMPLES, _MOST_FULL_EVALUATIONS = 30_000_000, 300
+# half of them fewer than 250. 1500 of 20 s at 1 kHz take five seconds; most evaluations of a long
+# record use a part of it, and 300 all of it.
+_MOST_SAMPLES, _MOST_EVALUATIONS = 24_000_000, 300
 
 
 @dataclass(eq=False)
 class EvaluationBudget:
     """Count the evaluations of a model search and limit them: counted work, never elapsed time.
 
-    most_evaluations: of all samples of the record, or at least half of them
-    most_samples: samples of all evaluations together, besides ``most_full_evaluations`` of the
-        longest record
     evaluations, samples, longest: used so far; longest is the most samples of one evaluation
     incomplete: a search was cut short because the budget was exhausted
     watch: called at each evaluation with the poles of its model and ``evaluations``; what it
         raises ends the search
     """
 
-    most_evaluations: int = _MOST_EVALUATIONS
-    most_samples: int = _MOST_SAMPLES
-    most_full_evaluations: int = _MOST_FULL_EVALUATIONS
     evaluations: int = 0
     samples: int = 0
     longest: int = 0
@@ -53,24 +45,18 @@ class EvaluationBudget:
         """Count an evaluation of ``samples`` samples of a model with ``poles``."""
         self.longest = max(self.longest, samples)
         self.samples += samples
-        self.evaluations += 2 * samples > self.longest
+        self.evaluations += 1
         self.watch(poles, self.evaluations)
 
     @property
     def exhausted(self) -> bool:
         """Return True if no further order and no further model error is to be tried."""
-        most = self.most_samples + self.most_full_evaluations * self.longest
-        return self.evaluations > self.most_evaluations or self.samples > most
+        return self.samples > _MOST_SAMPLES + _MOST_EVALUATIONS * self.longest
 
     def stops(self) -> bool:
         """Return ``exhausted``, and note that the search is incomplete where it is."""
         self.incomplete |= self.exhausted
         return self.exhausted
-
-    def renewed(self) -> EvaluationBudget:
-        """Return a budget of the same limits with nothing used."""
-        limits = self.most_evaluations, self.most_samples, self.most_full_evaluations
-        return EvaluationBudget(*limits, watch=self.watch)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +114,7 @@ def descend(project: Project, start: Projection, box: Box, evaluations: int) -> 
         at, cost, moved = tried, new_cost, True
         ratio = gained / promised if promised > 0 else 1.0
         damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
-        if gained <= _CONVERGED * cost / len(at.residual) and damping < 1:
+        if gained <= CONVERGED * cost / len(at.residual) and damping < 1:
             break
     return at
 

@@ -11,46 +11,23 @@ simplification of the derivative).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from numpy.polynomial import polynomial
 from scipy import fft, linalg, ndimage
 
-from omsm_ros.core.estimation.model_structure import ScaledStructure
-from omsm_ros.core.estimation.optimisation import EvaluationBudget, Project, Projection, descend
-from omsm_ros.core.kinematics.trajectories import s_curve
-from omsm_ros.core.lti.transfer_function import ComplexArray, Structure, TransferFunction
+from omsm_ros.core.estimation.model_structure import Fit, ScaledStructure
+from omsm_ros.core.estimation.optimisation import Projection
+from omsm_ros.core.estimation.parallel_sections import close_period
+from omsm_ros.core.lti.transfer_function import ComplexArray, Structure
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.linear_algebra import BLOCK_VALUES, inverse_gram, least_squares
 
-# Duration of the bridge: across the whole travel it adds nothing near the fastest motion.
-_BRIDGE_S = 0.3
-# Least length of the bridge, so that it is smooth at a low sampling rate too.
-_MIN_BRIDGE_SAMPLES = 64
-# Rest after the bridge, in which a lightly damped mode decays.
-STATIONARY_S = 1.0
-# Most rest per duration: a record of milliseconds shows no mode that rings for a second.
-_PLATEAU_SHARE = 4.0
 # Lines over which power is averaged: it is then known to 10 %.
 _SMOOTHING_BINS = 101
-
-
-def close_period(motion: FloatArray, period: float) -> FloatArray:
-    """Return ``motion`` (n,) closed to a period by a smooth bridge to its start and a rest.
-
-    The rest lets modes decay before the period repeats; the length suits the FFT.
-    """
-    duration = len(motion) * period
-    bridge = max(round(min(_BRIDGE_S, duration) / period), _MIN_BRIDGE_SAMPLES)
-    rest = round(min(STATIONARY_S, _PLATEAU_SHARE * duration) / period)
-    total = fft.next_fast_len(len(motion) + bridge + rest, real=True)
-    phase = np.arange(1, total - len(motion) + 1) / bridge
-    way_back = motion[-1] + (motion[0] - motion[-1]) * s_curve(np.asarray(phase))
-    return np.concatenate([motion, way_back])
 
 
 def denoised(spectrum: ComplexArray, noise_power: float) -> ComplexArray:
@@ -75,16 +52,32 @@ def denoised(spectrum: ComplexArray, noise_power: float) -> ComplexArray:
 _RANK_TOLERANCE = 1e-12
 # Block size of LAPACK.
 _BLOCK = 32
-# Iterations from each start; held inputs need five (docs/design/identification-ablation.md).
-_RACE_EVALUATIONS = 5
-# Most iterations from the best start: it bounds fits along a flat valley, others converge.
-_FINISH_EVALUATIONS = 60
-# Radians a sample, thirty times half the sampling rate: a faster pole would be no other model.
-_FASTEST = 100.0
 # Largest share of a period that is not compared where products are summed over lines.
 _FEW_MISSING = 0.25
+# Slow model errors thin records of twice as many samples; a step test at 1 kHz has 20 000.
+ENOUGH_SAMPLES = 20_000
+# Sums over lines of a long problem, and the frequency of the lowest one over its width.
+_SUMS, _DENSE = 10_000, 64
 # Exponent of e to which the pulse before a record has decayed where its band ends.
 _PULSE_END = 14.0
+
+
+# Radians a sample, thirty times half the sampling rate: a faster pole would be no other model.
+_FASTEST = 100.0
+
+
+def _driven(
+    drives: Sequence[tuple[ComplexArray, int]], s: ComplexArray, lag: ComplexArray
+) -> ComplexArray:
+    """Return the spectra of the linear columns, s^i · lag · drive, shape (terms, k)."""
+    terms = []
+    for spectrum, count in drives:
+        term = lag * spectrum
+        # Repeated products are faster than powers of complex numbers.
+        for _ in range(count):
+            terms.append(term)
+            term = term * s
+    return np.array(terms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +129,14 @@ class Problem:
     def closed_spectrum(self, values: FloatArray) -> ComplexArray:
         """Transform of ``values`` (n,), closed to a period, at ``s``, shape (k,)."""
         return np.asarray(fft.rfft(close_period(values, self.period)))[: len(self.s)]
+
+    def without_background(self, lag: Fit) -> ComplexArray:
+        """Return the spectrum (k,) of the output without the background that ``lag`` has.
+
+        Lost samples are replaced by the motion times its gain.
+        """
+        output = self.output - self.background @ lag.background
+        return self.closed_spectrum(np.where(self.used, output, lag.gain * self.input))
 
     @cached_property
     def _spectrum(self) -> ComplexArray:
@@ -190,6 +191,10 @@ class Problem:
         every = np.concatenate([powers * (lag * pulse) for pulse in self._pulses])
         return np.asarray(fft.irfft(every, self.closed_length)[:, : len(self.input)].T)
 
+    def terms(self, structure: Structure) -> int:
+        """Return the number of linear columns that the inputs make."""
+        return sum(count for _, count in self.drives(structure))
+
     def box(self, scaled: ScaledStructure) -> tuple[FloatArray, FloatArray]:
         """Return the bounds of ψ: no pole is faster than the samples can show."""
         lower, upper = scaled.bounds()
@@ -199,11 +204,12 @@ class Problem:
         return lower, upper
 
     @cached_property
-    def _target(self) -> FloatArray:
-        return self.output[self._kept]
+    def target(self) -> FloatArray:
+        """The compared samples of the output, (k,)."""
+        return self.output[self.kept]
 
     @cached_property
-    def _kept(self) -> slice | IntArray:
+    def kept(self) -> slice | IntArray:
         """Places of the compared samples, without a copy where no sample between them is lost."""
         places = np.flatnonzero(self.used)
         whole = len(places) > 0 and places[-1] - places[0] < len(places)
@@ -211,32 +217,36 @@ class Problem:
 
     @cached_property
     def _fixed(self) -> FloatArray:
-        return self.background[self._kept]
+        return self.background[self.kept]
 
     def _in_time(self, spectra: ComplexArray) -> FloatArray:
-        found = np.empty((len(spectra), len(self._target)))
+        found = np.empty((len(spectra), len(self.target)))
         # In blocks: all at once would double the memory of a long record.
         step = max(BLOCK_VALUES // self.closed_length, 1)
         for first in range(0, len(spectra), step):
             part = slice(first, first + step)
-            found[part] = fft.irfft(spectra[part], self.closed_length, axis=-1)[:, self._kept]
+            found[part] = fft.irfft(spectra[part], self.closed_length, axis=-1)[:, self.kept]
         return found
+
+    def _driven(self, scaled: ScaledStructure, nonlinear: FloatArray) -> ComplexArray:
+        """Return the spectra of the linear columns, shape (terms, k)."""
+        return _driven(self.drives(scaled.structure), self.s, scaled.lag(nonlinear, self.s))
 
     def project(self, scaled: ScaledStructure, nonlinear: FloatArray) -> Projection:
         """Return the residual at one ψ after the linear parameters are eliminated."""
-        structure, lag = scaled.structure, scaled.lag(nonlinear, self.s)
-        moved = self._in_time(self._driven(structure, lag))
+        driven = self._driven(scaled, nonlinear)
+        moved = self._in_time(driven)
         # In the memory order of LAPACK: in that of numpy it takes five times as long.
-        columns = np.concatenate([moved, self._fixed.T, self._target[np.newaxis]]).T
+        columns = np.concatenate([moved, self._fixed.T, self.target[np.newaxis]]).T
         size = columns.shape[1] - 1
         # With the target as the last column, its part in their basis is in the triangle.
         (packed, factors), triangle = linalg.qr(columns, mode="raw", check_finite=False)
         linear = least_squares(triangle[:size, :size], triangle[:size, size], _RANK_TOLERANCE)
-        residual = self._target - columns[:, :size] @ linear
+        residual = self.target - columns[:, :size] @ linear
 
         def normal() -> tuple[FloatArray, FloatArray]:
             basis = linalg.lapack.dorgqr(packed[:, :size], factors[:size], lwork=_BLOCK * size)[0]
-            answer = self._answer(structure, lag, linear[: len(moved)])
+            answer = linear[: len(moved)] @ driven
             slopes = self._in_time(scaled.lag_slopes(nonlinear, self.s) * answer).T
             jacobian = basis @ (basis.T @ slopes) - slopes
             return jacobian.T @ residual, jacobian.T @ jacobian
@@ -244,93 +254,35 @@ class Problem:
         return Projection(nonlinear, residual, linear, normal)
 
     @cached_property
-    def _weights(self) -> FloatArray:
-        """Roots of the weights (k,) of lines by which their products sum as those in time do."""
+    def weights(self) -> FloatArray:
+        """Factors (k,) on lines with which their products sum as those in time do."""
         weights = np.full(len(self.s), np.sqrt(2 / self.closed_length))
         weights[0] /= np.sqrt(2)
         # One line at half the sampling rate, which is real, is left out.
         weights[self.closed_length // 2 :] = 0.0
         return weights
 
-    def _lines(self, spectra: ComplexArray) -> FloatArray:
-        """Return ``spectra`` (…, k), real and imaginary parts side by side, weighted (…, 2k)."""
-        return np.asarray((spectra * self._weights).view(np.float64))
-
-    def _compared_lines(self, values: FloatArray) -> FloatArray:
-        """Return ``values`` (k,) of the compared samples, 0 elsewhere, as :meth:`_lines`."""
-        padded = fft.rfft(self.on_grid(values, 0.0), self.closed_length)
-        return self._lines(np.asarray(padded)[: len(self.s)])
+    def compared_lines(self, values: FloatArray) -> ComplexArray:
+        """Return the weighted spectrum (k,) of ``values`` of the compared samples, 0 elsewhere."""
+        spectrum = fft.rfft(self.on_grid(values, 0.0), self.closed_length)
+        return np.asarray(self.weights * spectrum[: len(self.s)])
 
     @cached_property
-    def _background_lines(self) -> FloatArray:
-        return np.array([self._compared_lines(column) for column in self._fixed.T])
+    def lines(self) -> CompressedProblem | None:
+        """The problem by lines of spectra, with the static gain where nothing is compared.
 
-    @cached_property
-    def _filled(self) -> FloatArray:
-        """Lines of the output where it is compared, and of the motion times the gain elsewhere."""
-        moved = self.motion[self._kept]
-        gain = least_squares(np.column_stack([moved, self._fixed]), self._target)[0]
-        left = self._compared_lines(self._target - gain * moved)
-        return np.asarray(left + gain * self._lines(self._spectrum))
-
-    def by_lines(self, scaled: ScaledStructure) -> Project:
-        """Return a projection as :meth:`project` whose products are sums over lines of spectra.
-
-        Samples not compared are filled in with the last model a step started from (expectation
-        maximisation, Dempster et al. 1977): the sum of squares is exact, the linear parameters are
-        the best ones once the descent has come to rest. The first model is the static gain.
+        None where more than a quarter of the period is not compared, or the response to what was
+        before the record is fitted, which is largest there.
         """
-        structure, filled = scaled.structure, self._filled
-        gram_fixed, fixed_target = (self._fixed.T @ v for v in (self._fixed, self._target))
-        terms = sum(count for _, count in self.drives(structure))
+        compared = len(self.target) > (1 - _FEW_MISSING) * self.closed_length
+        possible = compared and not self.fits_initial_condition
+        return CompressedProblem.of(self) if possible else None
 
-        def project(nonlinear: FloatArray) -> Projection:
-            lag = scaled.lag(nonlinear, self.s)
-            rows = self._lines(self._driven(structure, lag))
-            cross = rows @ self._background_lines.T
-            gram = np.block([[rows @ rows.T, cross], [cross.T, gram_fixed]])
-            inverse = inverse_gram(gram)
-            linear = inverse @ np.concatenate([rows @ filled, fixed_target])
-            answer = self._answer(structure, lag, linear[:terms])
-            moved = self._in_time(answer[np.newaxis])[0]
-            residual = self._target - self._fixed @ linear[terms:] - moved
-
-            def normal() -> tuple[FloatArray, FloatArray]:
-                nonlocal filled
-                left = self._compared_lines(residual)
-                filled = left + linear[:terms] @ rows + linear[terms:] @ self._background_lines
-                slopes = self._lines(scaled.lag_slopes(nonlinear, self.s) * answer)
-                taken = np.hstack([slopes @ rows.T, slopes @ self._background_lines.T]) @ inverse
-                missed = np.concatenate([rows @ left, self._fixed.T @ residual])
-                curvature = slopes @ slopes.T - taken @ gram @ taken.T
-                return taken @ missed - slopes @ left, curvature
-
-            return Projection(nonlinear, residual, linear, normal)
-
-        return project
-
-    def _answer(
-        self, structure: Structure, lag: ComplexArray, coefficients: FloatArray
-    ) -> ComplexArray:
-        """Return the spectrum of the linear columns times their ``coefficients`` (terms,), (k,)."""
-        total, place = np.zeros_like(lag), 0
-        for spectrum, count in self.drives(structure):
-            # Without a pole, the pulse before the record has no term.
-            part = np.append(coefficients[place : place + count], 0.0)
-            total += polynomial.polyval(self.s, part) * spectrum
-            place += count
-        return lag * total
-
-    def _driven(self, structure: Structure, lag: ComplexArray) -> ComplexArray:
-        """Return the spectra of the linear columns, s^i · lag · drive, shape (terms, k)."""
-        terms = []
-        for spectrum, count in self.drives(structure):
-            term = lag * spectrum
-            # Repeated products are faster than powers of complex numbers.
-            for _ in range(count):
-                terms.append(term)
-                term = term * self.s
-        return np.array(terms)
+    @cached_property
+    def sums(self) -> CompressedProblem | None:
+        """A long problem by sums over lines, in which orders are explored; None for a short one."""
+        long = len(self.target) > 2 * ENOUGH_SAMPLES and self.lines is not None
+        return CompressedProblem.of(self, _SUMS) if long else None
 
     def on_grid(self, values: FloatArray, elsewhere: float) -> FloatArray:
         """Return ``values`` (k,) of the compared samples at their places, (n,)."""
@@ -350,20 +302,35 @@ class Problem:
 
     def output_spectrum(self, fitted: Fit) -> ComplexArray:
         """Return the spectrum of the motion through G and gain of ``fitted``, at ``s``, (k,)."""
-        lag = fitted.scaled.lag(fitted.nonlinear, self.s)
-        driven = self._driven(fitted.structure, lag)[: len(fitted.numerator)]
+        driven = self._driven(fitted.scaled, fitted.nonlinear)[: len(fitted.numerator)]
         return np.asarray(fitted.driven[: len(driven)] @ driven, np.complex128)
+
+    def driven_spectrum(self, fitted: Fit) -> ComplexArray:
+        """Return the spectrum of the output of ``fitted`` without background, at ``s``, (k,)."""
+        return np.asarray(fitted.driven @ self._driven(fitted.scaled, fitted.nonlinear))
 
     def modelled(self, fitted: Fit) -> FloatArray:
         """Return the output (n,) of the fitted model at every sample."""
-        lag = fitted.scaled.lag(fitted.nonlinear, self.s)
-        driven = fitted.driven @ self._driven(fitted.structure, lag)
-        moved = fft.irfft(driven, self.closed_length)[: len(self.input)]
+        moved = fft.irfft(self.driven_spectrum(fitted), self.closed_length)[: len(self.input)]
         return np.asarray(moved + self.background @ fitted.background)
+
+    def fit_at(self, scaled: ScaledStructure, at: Projection) -> Fit:
+        """Return the fit of a projection."""
+        terms = self.terms(scaled.structure)
+        return Fit(scaled, at.nonlinear, at.linear[:terms], at.linear[terms:], at.residual)
+
+    def evaluated(self, structure: Structure, nonlinear: FloatArray) -> Fit:
+        """Return ``structure`` at the given ψ; only the linear parameters are fitted."""
+        scaled = ScaledStructure(structure, self.rate)
+        return self.fit_at(scaled, self.project(scaled, nonlinear))
+
+    def compared(self, fitted: Fit) -> Fit:
+        """Return a fit to other samples, with its parameters, and the residual here."""
+        return replace(fitted, residual=self.target - self.modelled(fitted)[self.kept])
 
     def sensitivity(self, fitted: Fit) -> FloatArray:
         """Return d output / d(numerator[1:], ψ, gain, further drives, background), shape (k, …)."""
-        driven = self._driven(fitted.structure, fitted.scaled.lag(fitted.nonlinear, self.s))
+        driven = self._driven(fitted.scaled, fitted.nonlinear)
         terms = len(fitted.numerator)
         by_numerator = fitted.gain * driven[1:terms]
         slopes = fitted.scaled.lag_slopes(fitted.nonlinear, self.s)
@@ -374,7 +341,7 @@ class Problem:
     def _with_background_columns(self, spectra: Sequence[ComplexArray]) -> FloatArray:
         """Return columns (k, …) of all ``spectra`` (…, k), then those of the background."""
         count = sum(map(len, spectra))
-        rows = np.empty((count + self.background.shape[1], len(self._target)))
+        rows = np.empty((count + self.background.shape[1], len(self.target)))
         rows[count:] = self._fixed.T
         first = 0
         for part in spectra:
@@ -387,106 +354,102 @@ class Problem:
 
         Those are the coefficients of 1, s and s² as factors of the response.
         """
-        lag = fitted.scaled.lag(fitted.nonlinear, self.s)
-        driven = self._driven(fitted.structure, lag)
+        driven = self._driven(fitted.scaled, fitted.nonlinear)
         terms = len(fitted.numerator)
         bends = self.s ** np.arange(3)[:, np.newaxis] * (fitted.numerator @ driven[:terms])
         return self._with_background_columns([bends, driven[terms:]])
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
-    """A fitted structure.
+class CompressedProblem:
+    """A problem by lines of its spectra, or by sums over neighbouring lines for a long record.
 
-    nonlinear: ψ;  driven: coefficients of the driven terms, scaled, those of the numerator first
-    background: coefficients (q,);  residual: (k,) [m]
+    Over a few lines G is constant, so that of every signal it needs the part along the input there,
+    one number. What the background explains of the rest is the same for every model.
+
+    inputs: of each input (m, k) at s (k,);  fixed: of the background, (q, 2k + q + 1)
+    target: of the output, (2k + q + 1,); the last q + 1 are of the rest
+    filled: returns it with the output as another fit has it where it is not compared
     """
 
-    scaled: ScaledStructure
-    nonlinear: FloatArray
-    driven: FloatArray
-    background: FloatArray
-    residual: FloatArray
+    rate: float
+    s: ComplexArray
+    inputs: ComplexArray
+    fixed: FloatArray
+    target: FloatArray
+    filled: Callable[[Fit], CompressedProblem]
 
-    @property
-    def structure(self) -> Structure:
-        """Poles, zeros and delay that were fitted."""
-        return self.scaled.structure
+    @classmethod
+    def of(cls, problem: Problem, lines: int = 0) -> CompressedProblem:
+        """Return ``problem`` by about ``lines`` sums, or by each line if 0 or for several inputs.
 
-    @property
-    def gain(self) -> float:
-        """Static gain, motion of the probe per motion of the axis."""
-        return float(self.driven[0])
+        What is not compared is filled in with the output of a model (expectation maximisation,
+        Dempster et al. 1977), here with the static gain.
+        """
+        static, weights = problem.evaluated(Structure(0, 0, False), np.empty(0)), problem.weights
+        columns = np.column_stack([problem.background[problem.used], problem.target])
+        background = np.array([problem.compared_lines(column) for column in columns[:, :-1].T])
+        inputs = np.array([weights * drive for drive, _ in problem.drives(static.structure)])
+        alone = len(inputs) == 1
+        along = inputs[0] if alone else np.ones_like(inputs[0])
+        widest = max(len(along) // lines, 1) if lines and alone else 1
+        # The lowest ones alone, where G may change from line to line.
+        dense = min(_DENSE * widest, len(along))
+        starts = np.append(np.arange(dense), np.arange(dense, len(along), widest))
+        power = np.add.reduceat(np.abs(along) ** 2, starts)
+        excited = power > 0
 
-    @property
-    def numerator(self) -> FloatArray:
-        """Scaled numerator (m+1,), numerator[0] = 1."""
-        return np.asarray(self.driven[: self.structure.zeros + 1] / self.driven[0])
+        def seen(signals: ComplexArray) -> ComplexArray:
+            sums = np.add.reduceat(along.conj() * signals, starts, axis=-1)
+            return np.ascontiguousarray(sums[..., excited] / np.sqrt(power[excited]))
 
-    @property
-    def size(self) -> int:
-        """Number of free parameters: of the structure, and of further drives."""
-        return self.structure.size + len(self.driven) - len(self.numerator)
+        s = np.add.reduceat(np.abs(along) ** 2 * problem.s, starts)[excited] / power[excited]
+        fixed, products = seen(background).view(np.float64), columns.T @ columns
+        scale, coordinates = np.sqrt(np.diag(products)), seen(inputs)
+        scale[scale == 0] = 1.0
 
-    @property
-    def samples(self) -> int:
-        """Number of samples compared."""
-        return len(self.residual)
+        def filled(fitted: Fit) -> CompressedProblem:
+            moved = weights * problem.driven_spectrum(fitted)
+            left = problem.compared_lines(fitted.residual) + fitted.background @ background
+            every = np.vstack([fixed, seen(moved + left).view(np.float64)])
+            rest = products - every @ every.T
+            inside = problem.target - columns[:, :-1] @ fitted.background - fitted.residual
+            rest[-1, -1] += np.vdot(moved, moved).real - inside @ inside
+            values, turn = np.linalg.eigh(rest / np.outer(scale, scale))
+            rest = scale[:, np.newaxis] * turn * np.sqrt(np.maximum(values, 0.0))
+            every = np.column_stack([every, rest])
+            return cls(problem.rate, s, coordinates, every[:-1], every[-1], filled)
 
-    @property
-    def sum_of_squares(self) -> float:
-        """Sum of the squared residual [m²]."""
-        return float(self.residual @ self.residual)
+        return filled(static)
 
-    @property
-    def rms(self) -> float:
-        """Root mean square of the residual [m]."""
-        return float(np.sqrt(self.sum_of_squares / self.samples))
+    def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
+        """Return the inputs, as :meth:`Problem.drives`."""
+        counts = [structure.zeros + 1] + (len(self.inputs) - 1) * [structure.poles + 1]
+        return list(zip(self.inputs, counts, strict=True))
 
-    @property
-    def dynamics(self) -> TransferFunction:
-        """G(s) with G(0) = 1."""
-        return self.scaled.transfer_function(self.nonlinear, self.numerator)
+    def without_background(self, lag: Fit) -> ComplexArray:
+        """Return the spectrum (k,) of the output without the background that ``lag`` has."""
+        alone = self.target - lag.background @ self.fixed
+        return np.asarray(alone[: 2 * len(self.s)].view(np.complex128))
 
+    def project(self, scaled: ScaledStructure, nonlinear: FloatArray) -> Projection:
+        """Return the residual at one ψ after the linear parameters are eliminated."""
+        lag, lines = scaled.lag(nonlinear, self.s), 2 * len(self.s)
+        rows = _driven(self.drives(scaled.structure), self.s, lag).view(np.float64)
+        terms = len(rows)
+        every = np.concatenate([np.zeros((terms, len(self.target))), self.fixed])
+        every[:terms, :lines] = rows
+        inverse = inverse_gram(every @ every.T)
+        linear = inverse @ (every @ self.target)
+        # Refined once, because the inverse has the squared condition of the columns.
+        linear += inverse @ (every @ (self.target - linear @ every))
+        residual = self.target - linear @ every
 
-def fit(
-    problem: Problem,
-    structure: Structure,
-    starts: Sequence[FloatArray],
-    evaluations: int = _FINISH_EVALUATIONS,
-    *,
-    budget: EvaluationBudget | None = None,
-) -> Fit:
-    """Improve each of ``starts``, ψ, by a few evaluations; return the minimum of the best of them.
+        def normal() -> tuple[FloatArray, FloatArray]:
+            answer = (linear[:terms] @ rows).view(np.complex128)
+            slopes = (scaled.lag_slopes(nonlinear, self.s) * answer).view(np.float64)
+            free = (slopes @ every[:, :lines].T) @ inverse @ every
+            free[:, :lines] -= slopes
+            return free @ residual, free @ free.T
 
-    evaluations: most iterations to that minimum
-    budget: counts the evaluations, if given
-    """
-    scaled = ScaledStructure(structure, problem.rate)
-    box = problem.box(scaled)
-
-    def project(nonlinear: FloatArray) -> Projection:
-        if budget is not None:
-            budget.count(int(np.count_nonzero(problem.used)), structure.poles)
-        return by_lines(nonlinear) if by_lines else problem.project(scaled, nonlinear)
-
-    best, least = None, np.inf
-    compared = np.sum(problem.used) > (1 - _FEW_MISSING) * problem.closed_length
-    # A response to what was before the record is largest where nothing is compared.
-    by_lines = None if problem.fits_initial_condition or not compared else problem.by_lines(scaled)
-    for start in starts:
-        found = descend(project, project(np.clip(start, *box)), box, _RACE_EVALUATIONS)
-        cost = float(np.sum(found.residual**2))
-        if best is None or cost < least:
-            best, least = found, cost
-    if best is None:
-        raise ValueError("no start to fit from, expected one or more")
-    return evaluated(problem, structure, descend(project, best, box, evaluations).nonlinear)
-
-
-def evaluated(problem: Problem, structure: Structure, nonlinear: FloatArray) -> Fit:
-    """Return ``structure`` at the given ψ; only the linear parameters are fitted."""
-    scaled = ScaledStructure(structure, problem.rate)
-    at = problem.project(scaled, nonlinear)
-    terms = len(at.linear) - problem.background.shape[1]
-    return Fit(scaled, at.nonlinear, at.linear[:terms], at.linear[terms:], at.residual)
+        return Projection(nonlinear, residual, linear, normal)

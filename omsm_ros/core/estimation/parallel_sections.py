@@ -19,13 +19,21 @@ import numpy as np
 from numpy.polynomial import polynomial
 from scipy import fft, signal
 
-from omsm_ros.core.estimation.output_error import close_period
+from omsm_ros.core.kinematics.trajectories import s_curve
 from omsm_ros.core.lti.frequency_response import Band
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 
 BAND_LIMITED, ZERO_ORDER, FIRST_ORDER = "band-limited", "zero-order", "first-order"
 HOLDS = (BAND_LIMITED, ZERO_ORDER, FIRST_ORDER)
+# Duration of the bridge: across the whole travel it adds nothing near the fastest motion.
+_BRIDGE_S = 0.3
+# Least length of the bridge, so that it is smooth at a low sampling rate too.
+_MIN_BRIDGE_SAMPLES = 64
+# Rest after the bridge, in which a lightly damped mode decays.
+STATIONARY_S = 1.0
+# Most rest per duration: a record of milliseconds shows no mode that rings for a second.
+_PLATEAU_SHARE = 4.0
 # Sampling period for which the durations of ``close_period`` are made.
 _NOMINAL_PERIOD_S = 1e-3
 # The variable w at half the sampling rate of a held input, in rad/sample: infinite, here large.
@@ -199,6 +207,20 @@ def variable(hold: str, frequency: FloatArray) -> ComplexArray:
         return np.asarray(2j * np.pi * frequency, np.complex128)
     with np.errstate(over="ignore"):
         return np.asarray(2j * np.clip(np.tan(np.pi * frequency), None, _INFINITE), np.complex128)
+
+
+def close_period(motion: FloatArray, period: float) -> FloatArray:
+    """Return ``motion`` (n,) closed to a period by a smooth bridge to its start and a rest.
+
+    The rest lets modes decay before the period repeats; the length suits the FFT.
+    """
+    duration = len(motion) * period
+    bridge = max(round(min(_BRIDGE_S, duration) / period), _MIN_BRIDGE_SAMPLES)
+    rest = round(min(STATIONARY_S, _PLATEAU_SHARE * duration) / period)
+    total = fft.next_fast_len(len(motion) + bridge + rest, real=True)
+    phase = np.arange(1, total - len(motion) + 1) / bridge
+    way_back = motion[-1] + (motion[0] - motion[-1]) * s_curve(np.asarray(phase))
+    return np.concatenate([motion, way_back])
 
 
 def closed_inputs(inputs: FloatArray, hold: str) -> FloatArray:

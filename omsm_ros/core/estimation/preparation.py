@@ -16,9 +16,11 @@ from itertools import pairwise
 import numpy as np
 from scipy import ndimage, signal
 
-from omsm_ros.core.estimation.model_order import StartingPoints
+from omsm_ros.core.estimation.model_order import StartingPoints, fit
+from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.noise import plateau_variance, plateaus, reading_step
-from omsm_ros.core.estimation.output_error import STATIONARY_S, Problem, fit
+from omsm_ros.core.estimation.output_error import Problem
+from omsm_ros.core.estimation.parallel_sections import STATIONARY_S
 from omsm_ros.core.estimation.steps import (
     LEAST_SAMPLES,
     NOISE_FACTOR,
@@ -306,6 +308,8 @@ def _without_spikes(problem: Problem) -> tuple[Problem, int]:
 
 # A lag and its roll-off are enough to show a residual of the size of a step.
 _PLAIN = Structure(2, 1, True)
+# Poles at which its fit starts, in units of the bandwidth of the motion; damping ratio 0.42.
+_RESONANCE = 3 * np.exp(np.array([2j, -2j]))
 # Limits of the residual over that of evenly spread errors. Plateaus at whole steps gave a fifth,
 # plateaus on one side of whole steps 2.8.
 _AS_ROUNDING = (0.1, 5.0)
@@ -334,7 +338,10 @@ def check_axis_steps(prepared: Prepared) -> None:
     if step**2 / 12 <= noise**2 or np.sum(uneven) <= _UNEVEN * np.sum(moves):
         return
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
-    plain = fit(problem, _PLAIN, StartingPoints(problem, lag).of(_PLAIN, [lag]))
+    starts = StartingPoints(problem, lag).of(_PLAIN, [lag])
+    # Readings this coarse may show a resonance to neither of them.
+    resonance = ScaledStructure(_PLAIN, problem.rate).nonlinear_of(_RESONANCE, starts[0][-1])
+    plain = fit(problem, _PLAIN, [resonance, *starts])
     moving = prepared.steps.moving[problem.used]
     left = float(np.mean(plain.residual[moving] ** 2)) - noise**2 if np.any(moving) else 0.0
     lines = np.linspace(0, 0.5 / problem.period, _FREQUENCIES)

@@ -16,7 +16,13 @@ from omsm_ros.core.identification.covariance_terms import inter_sample_delay_bou
 from omsm_ros.core.identification.evidence import IdentificationEvidence
 from omsm_ros.core.identification.model_error_checks import accuracy_on, model_errors
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, low_frequency_delay_uncertainty
-from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM, HALVES, SIZES, UP_DOWN
+from omsm_ros.core.model_errors.residual_diagnostics import (
+    FALSE_ALARM,
+    HALVES,
+    SIZES,
+    UP_DOWN,
+    differ,
+)
 from omsm_ros.errors import CalibrationError
 
 Findings = Iterator[Finding]
@@ -175,11 +181,16 @@ _DIFFERENT_PARTS = {
 
 def consistency(e: IdentificationEvidence) -> Findings:
     """Reserve a test whose parts differ by more than chance; of recordings, name the one apart."""
-    differing = [contrast for contrast in e.contrasts if contrast.significant]
+    differing = [contrast for contrast in e.contrasts if differ(contrast)]
     recordings = [c for c in differing if c.parts not in _DIFFERENT_PARTS]
-    farthest = max(recordings, key=lambda c: abs(c.lag / c.lag_uncertainty), default=None)
+    farthest = max(
+        recordings,
+        key=lambda c: abs(c.lag_difference_s or 0.0) / (c.lag_difference_uncertainty_s or np.inf),
+        default=None,
+    )
     for contrast in differing:
-        values: dict[str, object] = {"lag_s": contrast.lag, "gain": contrast.gain, "p": contrast.p}
+        values: dict[str, object] = {"lag_s": contrast.lag_difference_s, "p": contrast.p}
+        values["gain"] = contrast.gain_difference
         code = _DIFFERENT_PARTS.get(contrast.parts)
         if code is None:
             if contrast is not farthest:

@@ -18,15 +18,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.calibration.certificate import Undetected, UndetectedEntry
+from omsm_ros.core.calibration.certificate import PartsCompared, Undetected, UndetectedEntry
 from omsm_ros.core.calibration.intended_use import IntendedUse
 from omsm_ros.core.estimation.covariance import inter_sample_motion_covariance
-from omsm_ros.core.estimation.output_error import Fit
+from omsm_ros.core.estimation.model_structure import Fit
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.estimation.steps import LEAST_SAMPLES, Steps
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.model_errors.families import CREEP
-from omsm_ros.core.model_errors.residual_diagnostics import Contrast, ResidualDiagnostics
+from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics, differ
 from omsm_ros.core.model_errors.undetected import (
     UNDETECTED,
     UndetectedTerm,
@@ -129,7 +129,7 @@ COVARIANCE_TERMS: tuple[Callable[[Prepared, Fit], FloatArray], ...] = (inter_sam
 """Terms that add to the covariance (p, p) of every fit."""
 
 
-def contrast_covariance(found: Sequence[Contrast], dynamics: TransferFunction) -> FloatArray:
+def contrast_covariance(found: Sequence[PartsCompared], dynamics: TransferFunction) -> FloatArray:
     """Return the covariance (p, p) of parts of a test that differ; zero where none do.
 
     The whole difference counts as a standard uncertainty: a scan moves less than a step, so its
@@ -138,7 +138,12 @@ def contrast_covariance(found: Sequence[Contrast], dynamics: TransferFunction) -
     gain = np.concatenate([dynamics.numerator, np.zeros(len(dynamics.denominator))])
     lag = np.zeros_like(gain)
     lag[-1] = 1.0
-    rows = [row for c in found if c.significant for row in (c.gain * gain, c.lag * lag)]
+    rows = [
+        row
+        for c in found
+        if differ(c)
+        for row in ((c.gain_difference or 0.0) * gain, (c.lag_difference_s or 0.0) * lag)
+    ]
     stacked = np.asarray(rows).reshape(-1, len(gain))
     return np.asarray(stacked.T @ stacked)
 

@@ -6,9 +6,9 @@ from functools import cached_property
 
 import numpy as np
 
-from omsm_ros.core.calibration.certificate import Undetected
+from omsm_ros.core.calibration.certificate import PartsCompared, Undetected
 from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse
-from omsm_ros.core.estimation.output_error import Fit
+from omsm_ros.core.estimation.model_structure import Fit
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.covariance_terms import ReferenceLag
 from omsm_ros.core.identification.model_choice import ChosenModel
@@ -21,7 +21,6 @@ from omsm_ros.core.identification.residual_tests import (
 from omsm_ros.core.identification.response_uncertainty import ResponseUncertainty
 from omsm_ros.core.lti.frequency_response import ResponseLimits
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.core.model_errors.residual_diagnostics import Contrast
 from omsm_ros.core.streams.motion_record import MotionRecord
 
 
@@ -43,7 +42,7 @@ class IdentificationEvidence:
     limits: ResponseLimits
     searched: SearchResult
     undetected: Undetected = field(default_factory=Undetected)
-    contrasts: Sequence[Contrast] = ()
+    contrasts: Sequence[PartsCompared] = ()
     reference: ReferenceLag | None = None
     use: IntendedUse = PAPER_USE
 

@@ -16,11 +16,12 @@ The static gains are regressions on the plateaus. With a reference sensor on the
 are three, and two of them show whether the scale of the probe or that of the encoder is wrong.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from functools import partial, wraps
+from functools import partial
 from itertools import pairwise
-from typing import Any, ParamSpec
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,6 @@ from omsm_ros.core.calibration.certificate import (
     Finding,
     GainEstimate,
     Origin,
-    PartsCompared,
     Residual,
     Response,
     StaticGain,
@@ -41,8 +41,8 @@ from omsm_ros.core.calibration.certificate import (
 from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse
 from omsm_ros.core.calibration.latency import unresolved_latency
 from omsm_ros.core.estimation.covariance import with_random_walk
+from omsm_ros.core.estimation.model_structure import Fit
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
-from omsm_ros.core.estimation.output_error import Fit
 from omsm_ros.core.estimation.preparation import Prepared, check_axis_steps, check_gain, prepare
 from omsm_ros.core.estimation.steps import Edge, find_steps
 from omsm_ros.core.identification.checks import CHECKS, limits_of
@@ -72,7 +72,7 @@ from omsm_ros.core.lti.modes import (
 )
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.model_errors.families import DRIFT, MODE
-from omsm_ros.core.model_errors.residual_diagnostics import Contrast, contrasts
+from omsm_ros.core.model_errors.residual_diagnostics import contrasts
 from omsm_ros.core.model_errors.undetected import alternative_mode_covariance
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.streams.motion_record import MotionRecord
@@ -82,7 +82,6 @@ from omsm_ros.quantities import MASS
 
 DEFAULT_LIMITS = ResponseLimits()
 NO_ORIGIN = Origin()
-Parameters = ParamSpec("Parameters")
 Progress = Callable[..., object]
 # Stages of an identification, as the action states them.
 STEPS, ORDER, UNCERTAINTY = "steps", "order", "uncertainty"
@@ -115,22 +114,16 @@ class Identification:
     fit: Fit
 
 
-def _solvable(
-    compute: Callable[Parameters, Identification],
-) -> Callable[Parameters, Identification]:
-
-    @wraps(compute)
-    def computed(*args: Parameters.args, **options: Parameters.kwargs) -> Identification:
-        try:
-            return compute(*args, **options)
-        except np.linalg.LinAlgError as err:
-            raise IdentificationError("identification.singular", why=str(err)) from err
-
-    return computed
+@contextmanager
+def _solvable() -> Iterator[None]:
+    try:
+        yield
+    except np.linalg.LinAlgError as err:
+        raise IdentificationError("identification.singular", why=str(err)) from err
 
 
 @one_blas_thread()
-@_solvable
+@_solvable()
 def identify(
     record: MotionRecord,
     *,
@@ -282,7 +275,7 @@ def certificate_of(
         static_gain=_static_gain(evidence),
         model_errors=model_errors_of(evidence.searched, len(record) * record.sample_period),
         undetected=evidence.undetected,
-        consistency=tuple(_parts(contrast) for contrast in evidence.contrasts),
+        consistency=tuple(evidence.contrasts),
         noise_covariance=tuple(known.from_noise.ravel().tolist()),
     ).judged(findings)
 
@@ -336,20 +329,6 @@ def _static_gain(evidence: IdentificationEvidence) -> StaticGain:
         found,
         uncertainty=float(np.sqrt(evidence.known.gain_variance)),
         polarity=-int(np.sign(evidence.fit.gain)),
-    )
-
-
-def _parts(contrast: Contrast) -> PartsCompared:
-    def known(value: float) -> float | None:
-        return float(value) if np.isfinite(value) else None
-
-    return PartsCompared(
-        parts=contrast.parts,
-        gain_difference=known(contrast.gain),
-        gain_difference_uncertainty=known(contrast.gain_uncertainty),
-        lag_difference_s=known(contrast.lag),
-        lag_difference_uncertainty_s=known(contrast.lag_uncertainty),
-        p=contrast.p,
     )
 
 

@@ -13,21 +13,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.estimation.model_order import (
-    ENOUGH_SAMPLES,
     Candidate,
     StartingPoints,
     choose,
     explore,
+    fit,
     identifiable,
+    information,
 )
+from omsm_ros.core.estimation.model_structure import Fit
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
-from omsm_ros.core.estimation.output_error import STATIONARY_S, Fit, Problem, fit
+from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.estimation.preparation import Prepared
-from omsm_ros.core.estimation.steps import extended
 from omsm_ros.core.identification.residual_tests import noise_colour
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.core.model_errors.families import FASTEST_CREEP_S
-from omsm_ros.linear_algebra import triangle
+from omsm_ros.linear_algebra import orthonormal
 
 # χ² that each column must explain to be significant: four sigma.
 _CLEARLY_SHOWN = 16.0
@@ -56,13 +57,8 @@ def has_initial_response(
     columns = problem.initial_condition_response(fitted)[problem.used]
     # The fit already contains the part of a decay that is collinear with its parameters.
     known = problem.sensitivity(fitted)
-    lengths = [np.sqrt(np.einsum("kq,kq->q", part, part)) for part in (columns, known)]
-    scale = np.concatenate([*lengths, np.ones(1)])
-    scale[scale == 0] = 1.0
-    factor = triangle(columns, known, fitted.residual[:, np.newaxis]) / scale
-    left, values, _ = np.linalg.svd(factor[:-1, :-1])
-    spanned = left[:, values > _SPANNED * values[0]]
-    explained = float(np.sum((spanned.T @ factor[:-1, -1]) ** 2))
+    spanned = orthonormal(np.column_stack([columns, known]), _SPANNED)
+    explained = float(np.sum((fitted.residual @ spanned) ** 2))
     rest = fitted.sum_of_squares - explained
     size = spanned.shape[1] - known.shape[1]
     return bool(explained * fitted.samples > colour * _CLEARLY_SHOWN * max(size, 1) * rest)
@@ -93,18 +89,17 @@ def choose_model(
     before: chosen for nearly the same problem; structures start where they ended there
     """
     problem, budget = prepared.problem, budget or EvaluationBudget()
-    lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget)
+    part = problem.sums
+    lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget, part=part)
     known = {c.fit.structure: c.fit for c in before.candidates} if before else {}
-    part, found = _excerpt(prepared), list[Fit]()
-    points = StartingPoints(part or problem, lag if part is None else _refitted(part, lag, budget))
+    points = StartingPoints(part or problem, lag)
 
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
-        if structure in known:
-            return _refitted(problem, known[structure], budget)
-        if part is None:
-            return fit(problem, structure, points.of(structure, smaller), budget=budget)
-        found.append(fit(part, structure, points.of(structure, found), budget=budget))
-        return _refitted(problem, found[-1], budget)
+        same = known.get(structure)
+        starts = points.of(structure, smaller) if same is None else [same.nonlinear]
+        best = min(smaller, key=lambda fit: fit.sum_of_squares, default=lag)
+        filled = part and part.filled(best)
+        return fit(problem, structure, starts, budget=budget, part=filled)
 
     colour = noise_colour(problem, lag, prepared.steps)
     explored = explore(fit_structure, order, colour, budget)
@@ -114,41 +109,19 @@ def choose_model(
         for c in explored
         if identifiable(c.fit.dynamics, problem.period, duration) and not _relaxes(c.fit.dynamics)
     ]
-    free = ChosenModel(choose(candidates), candidates)
+
+    def chosen(among: list[Candidate], free: ChosenModel | None = None) -> ChosenModel:
+        best = choose(among)
+        if part is None:
+            return ChosenModel(best, among, free)
+        exact = fit(problem, best.fit.structure, [best.fit.nonlinear], budget=budget)
+        finished = Candidate(exact, information(exact, colour))
+        return ChosenModel(finished, [finished if c is best else c for c in among], free)
+
+    free = chosen(candidates)
     if not order:
         return free
-    asked = [c for c in explored if c.fit.structure.poles == order]
-    return ChosenModel(choose(asked), asked, free)
-
-
-def _refitted(problem: Problem, known: Fit, budget: EvaluationBudget) -> Fit:
-    return fit(problem, known.structure, [known.nonlinear], budget=budget)
-
-
-def _excerpt(prepared: Prepared) -> Problem | None:
-    """Return the first edges of a long step test, in which fits start; rests after them end early.
-
-    None where that would leave out less than half of the record.
-    """
-    problem, moving = prepared.problem, prepared.steps.moving
-    rest = round(STATIONARY_S / problem.period)
-    near = extended(extended(moving, rest)[::-1], rest)[::-1]
-    kept = np.flatnonzero(near)[:ENOUGH_SAMPLES]
-    whole = problem.fits_initial_condition or len(problem.starts) > 1
-    if whole or 2 * len(kept) > len(moving) or np.all(moving[kept]):
-        return None
-    kept = kept[: np.flatnonzero(~moving[kept])[-1] + 1]  # not in the middle of a move
-    return replace(
-        problem,
-        input=problem.input[kept],
-        output=problem.output[kept],
-        used=problem.used[kept],
-        background=problem.background[kept],
-        further=np.array([motion[kept] for motion in problem.further]),
-        plateau=None,
-        errors_in_variables=None,
-        recorded=None,
-    )
+    return chosen([c for c in explored if c.fit.structure.poles == order], free)
 
 
 def _relaxes(dynamics: TransferFunction) -> bool:

@@ -20,7 +20,7 @@ from omsm_ros.core.calibration.certificate import (
     ModelErrors,
 )
 from omsm_ros.core.estimation.covariance import parameter_covariance
-from omsm_ros.core.estimation.output_error import fit
+from omsm_ros.core.estimation.model_order import fit
 from omsm_ros.core.identification.evidence import IdentificationEvidence
 from omsm_ros.core.identification.model_error_search import ModelledTerm, SearchResult
 from omsm_ros.core.lti.frequency_response import response_band

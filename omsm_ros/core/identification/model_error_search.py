@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from omsm_ros.core.estimation.model_order import Candidate, information
+from omsm_ros.core.estimation.model_order import Candidate, fit, information
+from omsm_ros.core.estimation.model_structure import Fit
 from omsm_ros.core.estimation.noise import correct_errors_in_variables
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
-from omsm_ros.core.estimation.output_error import Fit, evaluated, fit
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.model_choice import ChosenModel
 from omsm_ros.core.lti.transfer_function import Structure
@@ -197,11 +197,11 @@ def _with_errors_in_variables(
     # Twice, because noise in the input may have led to a wild response.
     for _ in range(2):
         before = best[1].chosen.fit
-        known = evaluated(prepared.problem, before.structure, before.nonlinear)
+        known = prepared.problem.evaluated(before.structure, before.nonlinear)
         problem = correct_errors_in_variables(prepared.problem, known, prepared.steps.edges)
         if problem is None:
             break
-        quieter, own = replace(prepared, problem=problem), budget.renewed()
+        quieter, own = replace(prepared, problem=problem), EvaluationBudget(watch=budget.watch)
         quieter, found = choose(quieter, own, best[1])
         if information(found.chosen.fit) >= information(before):
             break
@@ -215,16 +215,11 @@ def _drift(prepared: Prepared, budget: EvaluationBudget) -> list[ScoreTest]:
     A nonlinear scale of the probe competes with it: steps that climb and return make both alike.
     """
     problem = prepared.problem
-    lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget)
+    start, part = [np.array([0.1])], problem.sums
+    lag = fit(problem, Structure(0, 0, True), start, budget=budget, part=part)
     diagnostics = ResidualDiagnostics(problem, lag, prepared.steps, (CREEP, DRIFT, LINEARITY))
-    found = list[ScoreTest]()
-    # If the decimated record shows none, all samples need not be tested.
-    for each in filter(None, (diagnostics.thinned, diagnostics)):
-        shown = _select_nuisance_terms(each, each.significant())
-        found = [judged for judged in shown if judged.term.family == DRIFT]
-        if not found:
-            break
-    return found
+    shown = _select_nuisance_terms(diagnostics, diagnostics.significant())
+    return [judged for judged in shown if judged.term.family == DRIFT]
 
 
 def _modelled_as_poles(
@@ -241,7 +236,7 @@ def _modelled_as_poles(
     fewer = diagnostics.thinned
     # If the decimated record shows none, all samples need not be tested.
     if fewer is not None:
-        there = evaluated(fewer.problem, rival.structure, rival.nonlinear)
+        there = fewer.problem.evaluated(rival.structure, rival.nonlinear)
         if not _improving_terms(prepared, fewer, there, budget):
             return []
     return _improving_terms(prepared, diagnostics, rival, budget)
@@ -285,8 +280,9 @@ def _select_nuisance_terms(
 def _with_columns(
     prepared: Prepared, shown: Sequence[ScoreTest], before: Sequence[ModelledTerm] = ()
 ) -> tuple[Prepared, list[ModelledTerm]]:
-    background = prepared.problem.background
-    added = []
+    if not shown:
+        return prepared, []
+    background, added = prepared.problem.background, []
     drifts = [b.columns.stop - b.columns.start for b in before if b.term.family == DRIFT]
     for judged in shown:
         start = background.shape[1]

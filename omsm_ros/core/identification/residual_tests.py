@@ -12,6 +12,7 @@ from scipy import stats
 
 from omsm_ros.core.estimation.covariance import autoregression
 from omsm_ros.core.estimation.impulse_response import gram_of
+from omsm_ros.core.estimation.model_structure import Fit
 from omsm_ros.core.estimation.noise import (
     motion_error_variance,
     motion_scatter,
@@ -19,7 +20,7 @@ from omsm_ros.core.estimation.noise import (
     reading_step,
     scatter_in_time,
 )
-from omsm_ros.core.estimation.output_error import Fit, Problem
+from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.estimation.steps import Steps, extended
 from omsm_ros.core.lti.frequency_response import FrequencyResponse, frequency_response
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray

@@ -7,7 +7,8 @@ import numpy as np
 from scipy import fft, linalg, signal
 
 from omsm_ros.core.estimation.covariance import noise_spectrum, parameter_covariance
-from omsm_ros.core.estimation.output_error import Fit, Problem
+from omsm_ros.core.estimation.model_structure import Fit
+from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.covariance_terms import COVARIANCE_TERMS
 from omsm_ros.core.identification.model_choice import ChosenModel

@@ -17,10 +17,12 @@ from functools import cached_property
 import numpy as np
 from scipy import fft, stats
 
+from omsm_ros.core.calibration.certificate import PartsCompared
 from omsm_ros.core.estimation.covariance import noise_spectrum, weighted_gram
-from omsm_ros.core.estimation.model_order import ABOVE_CONTENT, ENOUGH_SAMPLES, coarser
+from omsm_ros.core.estimation.model_order import ABOVE_CONTENT, coarser
+from omsm_ros.core.estimation.model_structure import Fit
 from omsm_ros.core.estimation.noise import RandomWalk, scatter_in_time, uneven_rows, with_walk
-from omsm_ros.core.estimation.output_error import Fit, Problem, evaluated
+from omsm_ros.core.estimation.output_error import ENOUGH_SAMPLES, Problem
 from omsm_ros.core.estimation.steps import Edge, Steps, segments
 from omsm_ros.core.model_errors.families import (
     BACKLASH,
@@ -98,25 +100,15 @@ class ResidualSpace:
 
     def _compared(self, columns: FloatArray) -> FloatArray:
         """Return those of ``columns`` (n, c) that are compared, (k, c), each in one piece."""
-        first, last = self._places[0], self._places[-1]
-        if last - first < len(self._places):
-            # Without a gap a slice suffices.
-            rows = columns.T[:, first : last + 1]
-            return (rows if rows.strides[1] == rows.itemsize else np.ascontiguousarray(rows)).T
-        return np.take(columns.T, self._places, axis=1).T
-
-    @cached_property
-    def _places(self) -> IntArray:
-        return np.flatnonzero(self.problem.used)
+        rows = columns.T[:, self.problem.kept]
+        return (rows if rows.strides[1] == rows.itemsize else np.ascontiguousarray(rows)).T
 
     def _free(self, rows: FloatArray) -> None:
-        rows[:, ~self.problem.used] = 0.0
-        parts = [slice(i, i + BLOCK_ROWS) for i in range(0, len(self._places), BLOCK_ROWS)]
-        collinear = np.zeros((len(rows), self._basis.shape[1]))
-        for part in parts:
-            collinear += rows[:, self._places[part]] @ self._basis[part]
-        for part in parts:
-            rows[:, self._places[part]] -= collinear @ self._basis[part].T
+        kept = self.problem.kept
+        # A few rows at a time: the remainder of many would double the memory of a long record.
+        for part in np.array_split(rows, -(-rows.size // BLOCK_VALUES)):
+            inside = part[:, kept]
+            part[:, kept] = inside - (inside @ self._basis) @ self._basis.T
 
     def screen(self, columns: FloatArray, terms: int) -> FloatArray:
         """Return χ² in white noise of each group of ``terms`` neighbouring columns of (n, c).
@@ -341,7 +333,7 @@ class ResidualDiagnostics:
         if every < 2 or not rests or problem.shared > 0:
             return None
         fewer = coarser(problem, every)
-        fitted = evaluated(fewer, self.fitted.structure, self.fitted.nonlinear)
+        fitted = fewer.evaluated(self.fitted.structure, self.fitted.nonlinear)
         edges = tuple(
             Edge(edge.start // every, -(-edge.stop // every), edge.height) for edge in steps.edges
         )
@@ -407,28 +399,12 @@ _LEAST_EDGES = 4
 _TWO_SIZES = 1.5
 
 
-@dataclass(frozen=True, eq=False)
-class Contrast:
-    """The difference between two parts of a test, the first one less the second.
-
-    parts: their names;  gain: relative [1], lag: [s], each with standard uncertainty
-    p: probability of such differences by chance
-    """
-
-    parts: str
-    gain: float
-    gain_uncertainty: float
-    lag: float
-    lag_uncertainty: float
-    p: float
-
-    @property
-    def significant(self) -> bool:
-        """Return whether chance is less likely than FALSE_ALARM."""
-        return self.p < FALSE_ALARM
+def differ(compared: PartsCompared) -> bool:
+    """Return whether chance is less likely than FALSE_ALARM."""
+    return compared.p is not None and compared.p < FALSE_ALARM
 
 
-def contrasts(diagnostics: ResidualDiagnostics) -> list[Contrast]:
+def contrasts(diagnostics: ResidualDiagnostics) -> list[PartsCompared]:
     """Return the contrasts that the steps of this test allow."""
     starts, samples = diagnostics.problem.starts, len(diagnostics.problem.input)
     weights = [*_weights(diagnostics.steps, samples), *_recordings(starts, samples)]
@@ -463,12 +439,21 @@ def _weights(steps: Steps, samples: int) -> Iterator[tuple[str, FloatArray]]:
             yield name, np.repeat(np.where(first, 1.0, -1.0), length)
 
 
-def _contrast_of(diagnostics: ResidualDiagnostics, name: str, weight: FloatArray) -> Contrast:
+def _contrast_of(diagnostics: ResidualDiagnostics, name: str, weight: FloatArray) -> PartsCompared:
     fitted, problem = diagnostics.fitted, diagnostics.problem
     answer = fitted.gain * problem.response(fitted)
     by_gain = np.cumsum(weight * np.diff(answer, prepend=answer[0]))
     by_lag = -weight * np.gradient(answer, problem.period)
     score = diagnostics.space.score(np.column_stack([by_gain, by_lag]))
-    gain, lag = 2 * score.size
-    gain_uncertainty, lag_uncertainty = 2 * np.sqrt(np.diag(score.covariance))
-    return Contrast(name, gain, gain_uncertainty, lag, lag_uncertainty, float(np.exp(score.log_p)))
+    size, spread = 2 * score.size, 2 * np.sqrt(np.diag(score.covariance))
+    gain, gain_u, lag, lag_u = (
+        float(value) if np.isfinite(value) else None for value in np.ravel([size, spread], "F")
+    )
+    return PartsCompared(
+        parts=name,
+        gain_difference=gain,
+        gain_difference_uncertainty=gain_u,
+        lag_difference_s=lag,
+        lag_difference_uncertainty_s=lag_u,
+        p=float(np.exp(score.log_p)),
+    )

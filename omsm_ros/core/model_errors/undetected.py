@@ -19,10 +19,10 @@ from numpy.polynomial import polynomial
 from scipy import stats
 
 from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse
-from omsm_ros.core.estimation.model_order import MAX_POLES
-from omsm_ros.core.estimation.model_structure import ScaledStructure
+from omsm_ros.core.estimation.model_order import MAX_POLES, fit
+from omsm_ros.core.estimation.model_structure import Fit, ScaledStructure
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
-from omsm_ros.core.estimation.output_error import Fit, Problem, fit
+from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.lti.frequency_response import relative_response_jacobian, response_band
 from omsm_ros.core.lti.transfer_function import ComplexArray, Structure, TransferFunction
 from omsm_ros.core.model_errors.families import (

@@ -7,9 +7,8 @@ from scipy import signal
 from soaked import soaked
 
 from benchmarks.recorded import record_from_arrays
-from omsm_ros.core.estimation.model_order import StartingPoints
+from omsm_ros.core.estimation.model_order import StartingPoints, fit
 from omsm_ros.core.estimation.noise import correct_errors_in_variables, smoothed
-from omsm_ros.core.estimation.output_error import evaluated, fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.estimation.steps import Edge, find_steps
 from omsm_ros.core.identification.identify import identify
@@ -171,7 +170,7 @@ def test_real_hum_is_kept_while_encoder_noise_is_removed():
 
 def test_it_is_taken_out_once():
     _, quiet = cleaned(record_of(staircase(500), 3e-9))
-    again = evaluated(quiet, Structure(0, 0, True), np.array([0.1]))
+    again = quiet.evaluated(Structure(0, 0, True), np.array([0.1]))
     assert correct_errors_in_variables(quiet, again) is None
 
 

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from omsm_ros.core.estimation.model_order import fit
 from omsm_ros.core.estimation.model_structure import ScaledStructure
-from omsm_ros.core.estimation.output_error import Problem, fit
+from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.identification.model_choice import has_initial_response
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 

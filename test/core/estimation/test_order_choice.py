@@ -14,12 +14,13 @@ from omsm_ros.core.estimation.model_order import (
     cancels,
     choose,
     explore,
+    fit,
     identifiable,
     information,
     structures,
 )
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
-from omsm_ros.core.estimation.output_error import Problem, fit
+from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.errors import IdentificationError
 from omsm_ros.twin.plant import Plant
@@ -83,7 +84,7 @@ def test_a_structure_has_one_or_two_zeros_fewer_and_a_delay_or_none_the_smallest
 def test_no_order_is_begun_once_enough_was_tried():
     fit_structure = fitter(problem_of(PAIR))
     for order in (0, 3):
-        budget = EvaluationBudget(evaluations=10**6)
+        budget = EvaluationBudget(samples=10**9)
         found = explore(fit_structure, order, budget=budget)
         assert max(c.fit.structure.poles for c in found) == order
         assert budget.incomplete

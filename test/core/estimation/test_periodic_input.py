@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from omsm_ros.core.estimation.output_error import close_period, denoised
+from omsm_ros.core.estimation.output_error import denoised
+from omsm_ros.core.estimation.parallel_sections import close_period
 
 
 def test_the_period_closes_without_a_jump():

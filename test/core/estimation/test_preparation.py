@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.recorded import record_from_arrays
 from benchmarks.step_test import StepTest
-from omsm_ros.core.estimation.output_error import close_period
+from omsm_ros.core.estimation.parallel_sections import close_period
 from omsm_ros.core.estimation.preparation import faded_to_stationary, input_bandwidth, prepare
 from omsm_ros.core.kinematics.trajectories import Chirp
 from omsm_ros.errors import IdentificationError, StepTestError

@@ -8,13 +8,13 @@ from soaked import soaked
 
 from benchmarks.recorded import record_from_arrays
 from benchmarks.step_test import StepTest
+from omsm_ros.core.estimation.model_order import fit
 from omsm_ros.core.estimation.noise import (
     correct_errors_in_variables,
     plateau_variance,
     plateaus,
     reading_step,
 )
-from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.estimation.steps import find_steps
 from omsm_ros.core.identification.identify import identify

@@ -8,8 +8,8 @@ import pytest
 
 from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.calibration.certificate import RESERVATION
+from omsm_ros.core.estimation.model_order import fit
 from omsm_ros.core.estimation.model_structure import ScaledStructure
-from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.checks import consistency
 from omsm_ros.core.identification.covariance_terms import contrast_covariance
@@ -23,6 +23,7 @@ from omsm_ros.core.model_errors.residual_diagnostics import (
     UP_DOWN,
     ResidualDiagnostics,
     contrasts,
+    differ,
 )
 
 PERIOD, LAG, NOISE = 1e-3, 0.7e-3, 5e-9
@@ -78,16 +79,20 @@ FIRST = {
 def test_a_lag_that_differs_is_found_by_its_size_and_name(parts):
     apart = 20e-6
     contrast = found(stepped(LAG + np.where(FIRST[parts], apart, 0.0)))[parts]
-    assert contrast.significant
-    assert contrast.lag == pytest.approx(apart, abs=3 * contrast.lag_uncertainty)
-    assert contrast.lag_uncertainty < 0.2 * apart
+    assert differ(contrast)
+    assert contrast.lag_difference_s == pytest.approx(
+        apart, abs=3 * contrast.lag_difference_uncertainty_s
+    )
+    assert contrast.lag_difference_uncertainty_s < 0.2 * apart
 
 
 def test_a_gain_that_grows_with_the_step_is_found():
     gains = 1 + 2e-3 * FIRST[SIZES]
     contrast = found(stepped(alike(), gains))[SIZES]
-    assert contrast.significant
-    assert contrast.gain == pytest.approx(2e-3, abs=3 * contrast.gain_uncertainty)
+    assert differ(contrast)
+    assert contrast.gain_difference == pytest.approx(
+        2e-3, abs=3 * contrast.gain_difference_uncertainty
+    )
 
 
 @pytest.mark.parametrize(

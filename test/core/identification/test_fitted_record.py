@@ -10,8 +10,8 @@ from scipy import signal
 
 from benchmarks.recorded import record_from_arrays
 from benchmarks.step_test import StepTest
+from omsm_ros.core.estimation.model_order import fit
 from omsm_ros.core.estimation.model_structure import ScaledStructure
-from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.steps import find_steps
 from omsm_ros.core.identification.fitted_record import autocorrelation, fitted_record, mean_at_edges
 from omsm_ros.core.identification.identify import identify

@@ -11,7 +11,8 @@ from soaked import soaked
 from benchmarks.recorded import record_from_arrays
 from benchmarks.step_test import StepTest
 from omsm_ros.core.calibration.certificate import REJECTS
-from omsm_ros.core.estimation.output_error import Problem, fit
+from omsm_ros.core.estimation.model_order import fit
+from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.checks import agreement, dynamic_gain, independence
 from omsm_ros.core.identification.covariance_terms import reference_lag

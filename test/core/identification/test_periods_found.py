@@ -5,7 +5,7 @@ import pytest
 from late_steps import LATE, NOISE, STEPS, TIME, late_record
 from soaked import soaked
 
-from omsm_ros.core.estimation.output_error import fit
+from omsm_ros.core.estimation.model_order import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.model_choice import model_from_start
 from omsm_ros.core.identification.model_error_search import search_model_errors

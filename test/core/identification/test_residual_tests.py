@@ -9,7 +9,8 @@ from scipy import signal, stats
 from benchmarks.step_test import StepTest
 from benchmarks.twin_motions import respond
 from omsm_ros.core.calibration.verification import check_path
-from omsm_ros.core.estimation.output_error import Problem, fit
+from omsm_ros.core.estimation.model_order import fit
+from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.estimation.steps import find_steps
 from omsm_ros.core.identification.residual_tests import (
     independence,

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.recorded import record_from_arrays
 from benchmarks.step_test import StepTest
-from omsm_ros.core.estimation.output_error import fit
+from omsm_ros.core.estimation.model_order import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics

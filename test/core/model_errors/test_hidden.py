@@ -7,7 +7,7 @@ import pytest
 from scipy import signal, stats
 
 from omsm_ros.core.calibration.intended_use import PAPER_USE
-from omsm_ros.core.estimation.output_error import fit
+from omsm_ros.core.estimation.model_order import fit
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.core.model_errors.families import CREEP, MODE, STIFFENING
 from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM
