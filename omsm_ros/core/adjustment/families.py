@@ -335,7 +335,8 @@ def _of_the_spindle(priors: Sequence[Source]) -> list[Family]:
         ("c_error", "rad", 2, _C_HARMONICS, _angular, 1e-4),
     )
     # Every scale of C has errors of a few arc seconds; a ring of 50 mm may be off by 2.5 µm.
-    defaults = {"c_error/1": 1e-5 if "clocking" in stated else 1e-4, "c_error/2": 1e-5,
+    tested = any(p.name == "clocking" and p.evaluated for p in priors)
+    defaults = {"c_error/1": 1e-5 if tested else 1e-4, "c_error/2": 1e-5,
                 # Looks like a decentred part: only its size tells.
                 "spindle_radial/1": 5e-8}  # fmt: skip
     return [

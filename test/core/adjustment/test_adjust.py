@@ -191,6 +191,8 @@ def test_one_declaration_without_evaluation_is_enough(table, name):
     (reason,) = found.verdict.reasons
     assert (reason.code, reason.names[0]) == ("declared_only", name)
     assert reason.value > reason.limit == 40e-9
+    # Nor is it a test of C.
+    assert (found.source("c_error/1").uncertainty[0] > 1e-5) == (name == "clocking")
 
 
 @pytest.mark.soak
