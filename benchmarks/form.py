@@ -130,7 +130,7 @@ def _poses(runs: int) -> list[Row]:
             found = judged(PAPER_MIRROR, portion)
             registration = found.registration
             for name in POSE_PARAMETERS:
-                spread = registration.uncertainty(name)
+                spread = registration.spread.get(name)
                 off = registration.placement.value(name) - getattr(pose, name)
                 held.append(spread is not None and abs(off) <= 2 * spread)
             # Compared with the same noise on a part in the nominal pose.

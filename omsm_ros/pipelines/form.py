@@ -197,11 +197,11 @@ def form_facts(form: FormResult, measured: OpenedMeasurement) -> dict[str, Any]:
     placement = found.placement
     return {
         "pose": {
-            name: {"value": placement.value(name), "uncertainty": found.uncertainty(name)}
+            name: {"value": placement.value(name), "uncertainty": found.spread.get(name)}
             for name in POSE_PARAMETERS
         },
         "shape": {
-            name: UncertainValue(*external(name, v, found.uncertainty(name))).entry()
+            name: UncertainValue(*external(name, v, found.spread.get(name))).entry()
             for name, v in placement.shape
         },
         "deviation": {name: figure.entry() for name, figure in form.deviation.items()},

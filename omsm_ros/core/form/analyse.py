@@ -51,7 +51,7 @@ from omsm_ros.core.registration.register import CHUNK, register
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.streams.statistics import EvenSelection, noise_of
 from omsm_ros.core.surface.aperture import Aperture, best_covered, within_aperture
-from omsm_ros.core.surface.area_weights import area_weights
+from omsm_ros.core.surface.area_weights import LINE_WIDTH, area_weights
 from omsm_ros.core.surface.zernike_terms import (
     ZernikeIndex,
     first_terms,
@@ -65,8 +65,6 @@ ZERNIKES = first_terms(37, "fringe")
 _COVERED_WELL = 0.02
 # Points with all their effects take 50 MB. Extremes and counts are of all points.
 MOST_WEIGHED = 2**19
-# Largest width of a profile relative to its length.
-_LINE_WIDTH = 1e-6
 # Standard deviation of an estimate of noise from 6000 points, as a share of it.
 _CHANCE = 0.02
 # A hundred points for each Zernike term.
@@ -384,7 +382,7 @@ class _Gathered:
         if (repeated := repeated_noise(x, y, deviation)) is not None:
             return repeated, True, 0.0
         spans = sorted((float(np.ptp(x)), float(np.ptp(y))))
-        if spans[0] <= _LINE_WIDTH * spans[1]:
+        if spans[0] <= LINE_WIDTH * spans[1]:
             return *profile_noise(x if np.ptp(x) > np.ptp(y) else y, deviation), 0.0
         # Points may come in any order, where successive points are no neighbours.
         estimates = [*np.median(self._noise, axis=0), neighbour_noise(x, y, deviation)]

@@ -74,8 +74,9 @@ def compensation(map_: DeviationMap, surface: Surface, low_pass: float) -> Compe
     if min(len(cells.x), len(cells.y)) < 2:
         raise DataError("form.one_row", pitch=cells.pitch)
     smooth = cells.smoothed(np.concatenate([[cells.mean], cells.effects]), low_pass)
-    averaged = np.sqrt(cells.smoothed_square(cells.noise**2, low_pass))
-    spread = np.sqrt(averaged**2 + np.sum(smooth[1:] ** 2, axis=0))
+    rows, columns, weight = cells.weights(low_pass)
+    averaged = rows**2 @ (cells.noise**2 * cells.present) @ columns**2 / weight**2
+    spread = np.sqrt(averaged * cells.present + np.sum(smooth[1:] ** 2, axis=0))
     x, y = np.meshgrid(cells.x, cells.y)
     along_z = np.where(cells.present, _along_z(surface, x, y), np.nan)
     found = Compensation(

@@ -293,7 +293,7 @@ class GridCells:
 
     def smoothed(self, images: FloatArray, cutoff: float) -> FloatArray:
         """Return images (…, r, c) after a Gaussian low-pass of ``cutoff`` [m] (ISO 16610-61)."""
-        rows, columns, weight = self._weights(cutoff)
+        rows, columns, weight = self.weights(cutoff)
         made = rows @ (images * self.present) @ columns
         return np.asarray(made / weight * self.present)
 
@@ -301,19 +301,14 @@ class GridCells:
         """Return means and effects (1 + e, n) [m] at x, y (n,) [m] after :meth:`smoothed`."""
         from scipy.ndimage import map_coordinates
 
-        rows, columns, weight = self._weights(cutoff)
+        rows, columns, weight = self.weights(cutoff)
         images = np.concatenate([self.mean[np.newaxis], self.effects]) * self.present
         made = rows @ images @ columns / weight
         at = [(y - self.y[0]) / self.steps[1], (x - self.x[0]) / self.steps[0]]
         return np.array([map_coordinates(m, at, order=1, mode="nearest") for m in made])
 
-    def smoothed_square(self, variance: FloatArray, cutoff: float) -> FloatArray:
-        """Return the variance (r, c) of independent cells after :meth:`smoothed`."""
-        rows, columns, weight = self._weights(cutoff)
-        made = rows**2 @ (variance * self.present) @ columns**2
-        return np.asarray(made / weight**2 * self.present)
-
-    def _weights(self, cutoff: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def weights(self, cutoff: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the weights of rows (r, r) and columns (c, c), and their sum by cell (r, c)."""
         sizes = zip(self.present.shape, reversed(self.steps), strict=True)
         rows, columns = (gaussian_weights(size, cutoff / step) for size, step in sizes)
         return rows, columns, np.maximum(rows @ self.present @ columns, np.finfo(np.float64).tiny)

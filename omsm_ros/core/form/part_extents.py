@@ -32,7 +32,7 @@ from omsm_ros.core.form.part_figures import (
     real_effects,
     with_and_without,
 )
-from omsm_ros.core.form.zernike_fit import ZernikeFit, continued, fit_zernikes, separable
+from omsm_ros.core.form.zernike_fit import RimStrip, ZernikeFit, continued, fit_zernikes, separable
 from omsm_ros.core.registration.pose_parameters import root_of
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
@@ -75,8 +75,6 @@ _PEAKS, _SINGLE, _UNSEEN, _COMPANY = 6, 24, 0.05, 1 / 3
 MOST_UNSEEN = float(_UNSEEN ** -(_HALF_WAY**2))
 # Least singular value of a parabola through neighbours.
 _LEAST_SPREAD = 1e-2
-# Standard uncertainty of the rim's place, in distances of the tracks.
-_RIM_KNOWN = 1 / 12
 
 
 def extents_of_parts(
@@ -156,7 +154,7 @@ class _PartForm(NamedTuple):
         some = np.concatenate([even, order[:_HALF], order[-_HALF:]])
         drawn = _drawn(map_.part(some), self, form[some], some)
         still = np.zeros(2), np.zeros(2), (0.0, 0.0)
-        beyond, alone, more_square = gaps.beyond(self, form, map_.area) if gaps else still
+        beyond, alone, more_square = gaps.beyond(self, form) if gaps else still
         of_waves = [np.max(way * form + self.texture) - np.max(way * form) for way in (-1, 1)]
         found = []
         many = form[_equal_areas(map_.area, _MOST_FITTED)]
@@ -212,8 +210,8 @@ class _Gaps(NamedTuple):
     x, y: of the points (n,) [m];  spacing: of the tracks [m]
     near: points (q, k), the nearest first;  weights: of their sums that continue the form to a
         place of the rim, and that add to it if the curvature rises (2, q, k)
-    share: of the area between each place and its nearest point (q,)
-    strip: share of the area that a shift of the rim by its uncertainty covers
+    strip: along the rim, for the mean square of the form; None for an annulus or a polygon
+    share: of the area that half a track along the rim has
     """
 
     x: FloatArray
@@ -221,8 +219,8 @@ class _Gaps(NamedTuple):
     spacing: float
     near: IntArray
     weights: FloatArray
-    share: FloatArray
-    strip: float
+    strip: RimStrip | None
+    share: float
 
     @classmethod
     def of(cls, map_: DeviationMap, outline: Aperture, spacing: float) -> _Gaps | None:
@@ -237,26 +235,27 @@ class _Gaps(NamedTuple):
         (u, v), way = corners, np.cumsum(np.hypot(*np.diff(corners, prepend=corners[:, :1])))
         at = np.linspace(0, way[-1], _PLACES, endpoint=False)
         rim = np.stack([np.interp(at, way, u), np.interp(at, way, v)])
-        area = abs(float(np.sum(u[:-1] * v[1:] - u[1:] * v[:-1]))) / 2
         away, near = cKDTree(np.column_stack([x, y])).query(rim.T, _AROUND)
         close = away[:, 0] < _REACH * spacing
         near, rim = near[close], rim[:, close, np.newaxis]
-        share = away[close, 0] * way[-1] / _PLACES / area
-        strip = float(way[-1]) * spacing * _RIM_KNOWN / area
         places = (x[near] - rim[0]) + 1j * (y[near] - rim[1])
         parabola, plane = continued(places / spacing)
         weights = np.stack([parabola, (parabola - plane) / 2])
-        return cls(map_.x, map_.y, spacing, some[near], weights, share, strip)
+        every = np.stack([map_.x, map_.y]), map_.area / map_.area.sum(), outline, spacing
+        strip = RimStrip.of(*every, lambda x, _: np.ones((1, len(x))))
+        strip = None if outline.outline == "annulus" else strip
+        share = float(way[-1]) * spacing / abs(float(np.sum(u[:-1] * v[1:] - u[1:] * v[:-1])))
+        return cls(map_.x, map_.y, spacing, some[near], weights, strip, share)
 
     def beyond(
-        self, part: _PartForm, form: FloatArray, area: FloatArray
+        self, part: _PartForm, form: FloatArray
     ) -> tuple[FloatArray, FloatArray, tuple[float, float]]:
         """Return how far the form may reach beyond its extremes, and fall short of them (2,) [m].
 
         Third is what the form between the last track and the rim adds to its mean square, and the
         standard uncertainty of that [m²].
 
-        form, area: of the points of the ``part``, each (n,) [m], the area of any unit
+        form: of the points of the ``part`` (n,) [m]
         """
         rim, further = np.sum(self.weights * form[self.near], axis=2)
         weights, found, alone = np.sum(self.weights, axis=0), [], []
@@ -267,10 +266,11 @@ class _Gaps(NamedTuple):
             summit = self._summit(values + unseen, sign * part.above + unseen, part.error)
             found.append(max(summit, at_rim) - float(values.max()))
             alone.append(self._alone(values))
-        # The points stand for the way to the rim; along it the form changes by half on average.
-        more = float(self.share @ (rim**2 - form[self.near[:, 0]] ** 2)) / 4
-        higher = float(np.mean(rim**2) - np.average(form**2, weights=area)) if len(rim) else 0.0
-        square = (more, length(more, self.strip * higher))
+        rises = np.mean(rim**2 - form[self.near[:, 0]] ** 2) if len(rim) else 0.0
+        square = (0.0, self.share * abs(float(rises)) / 2)
+        if self.strip is not None:
+            more, errors = self.strip.missed(form[self.strip.points] ** 2)
+            square = float(more[0]), float(np.linalg.norm(errors))
         return np.maximum(found, 0.0), np.array(alone), square
 
     def _summit(self, values: FloatArray, above: FloatArray, noise: FloatArray) -> float:

@@ -127,18 +127,6 @@ def of_square(square: float, spread: float) -> UncertainValue:
     return UncertainValue(value, max(high - value, value - low) / 2)
 
 
-def without_columns(map_: DeviationMap, columns: FloatArray) -> DeviationMap:
-    """Return the map without its area-weighted fit of ``columns`` (k, n), effects included."""
-    weighted = columns * map_.area
-    right = np.column_stack([weighted @ map_.deviation, weighted @ map_.effects.T])
-    shares = fitted(weighted @ columns.T, right)
-    return replace(
-        map_,
-        deviation=map_.deviation - shares[:, 0] @ columns,
-        effects=map_.effects - shares[:, 1:].T @ columns,
-    )
-
-
 def fitted(gram: FloatArray, right: FloatArray) -> FloatArray:
     """Solve normal equations; for points on a line, where columns coincide, by minimum norm."""
     return np.asarray(np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ right)
@@ -151,7 +139,12 @@ def best_fit(map_: DeviationMap) -> DeviationMap:
     """
     moves = map_.effects[map_.moves]
     size = np.sqrt(np.mean(moves**2, axis=1))
-    return without_columns(map_, moves[size > 0] / size[size > 0, np.newaxis])
+    columns = moves[size > 0] / size[size > 0, np.newaxis]
+    weighted = columns * map_.area
+    right = np.column_stack([weighted @ map_.deviation, weighted @ map_.effects.T])
+    shares = fitted(weighted @ columns.T, right)
+    deviation = map_.deviation - shares[:, 0] @ columns
+    return replace(map_, deviation=deviation, effects=map_.effects - shares[:, 1:].T @ columns)
 
 
 class SmoothTerms(NamedTuple):

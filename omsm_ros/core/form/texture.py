@@ -474,7 +474,6 @@ def edge_roll_off(map_: DeviationMap, outline: Aperture) -> UncertainValue:
     weights = -columns[-1] @ np.linalg.pinv(columns[inner])
     weights = np.append(weights, 1.0)
     chosen = np.append(np.flatnonzero(inner), len(inner) - 1)
-
     fall, *found = rings.value[:, chosen] @ weights
     noise = map_.noise * np.linalg.norm(weights / np.sqrt(rings.points[chosen]))
     return UncertainValue(float(fall), float(np.hypot(noise, np.linalg.norm(found))))

@@ -5,14 +5,17 @@ equilibrated Gram matrix of condition 10⁶ leaves ten digits. Where the points 
 the disc to separate the terms, the highest orders are left out.
 """
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import comb
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, zernike_values
 from omsm_ros.errors import DataError
@@ -150,81 +153,101 @@ def fit_zernikes(
     )
     if rim is None:
         return fit
-    points = np.stack([x, y, deviation, np.ones(len(x)) if weights is None else weights])
-    return _continued_to_rim(fit, points, inverse, *rim)
+    places, each = np.stack([x, y]), np.ones(len(x)) if weights is None else weights
+    strip = RimStrip.of(places, each, *rim, lambda x, y: zernike_values(*disc.scaled(x, y), used))
+    if strip is None:
+        return fit
+    rest = deviation[strip.points] - fit.height(*places[:, strip.points])
+    more, errors = (inverse @ each for each in strip.missed(rest))
+    covariance = fit.covariance + errors @ errors.T
+    return replace(fit, coefficients=fit.coefficients + more, covariance=covariance)
 
 
-def _continued_to_rim(
-    fit: ZernikeFit, points: FloatArray, inverse: FloatArray, outline: Aperture, spacing: float
-) -> ZernikeFit:
-    """Return the ``fit`` with what its sums over points miss along the rim.
+class RimStrip(NamedTuple):
+    """What sums over points miss of integrals along the rim, where the form is steep.
 
     Points there stand for the way to the outline, along which mid-spatial form changes. In a strip
     that fades inwards, integrals of parabolas through neighbouring points replace the sums. Half
     the difference to planes is a standard uncertainty, because the next order of a series is one
     that the points do not show; another is the noise of the parabolas.
 
-    points: x, y, deviation [m] and weight (4, n);  inverse: of the Gram matrix (k, k)
-    spacing: of the tracks [m]
+    points: of the strip (s,);  along: number of successive ones whose mean is one value
+    together: which of these have a mean, for jumps to another line have none
+    parabola, plane: integrals for each mean (k, m);  sums: of the points (k, s)
     """
-    from scipy.sparse import csr_array  # these take long to load
-    from scipy.spatial import cKDTree
 
-    outline = outline.disc if outline.outline == "annulus" else outline
-    ends, rim = _around(outline)
-    depth = _STRIP * spacing / float(np.hypot(*rim).min())
-    size = outline.share_of_rim(points[0], points[1])
-    strip = size > 1 - 2 * depth
-    x, y, rest, weights = points[:, strip]
-    if outline.outline == "polygon" or depth >= 0.5 or len(x) < _AROUND:
-        return fit
-    rest = rest - fit.height(x, y)
-    (u, v, form), group = _means_along(np.stack([x, y, rest]), spacing)
-    if len(u) < _AROUND:
-        return fit
-    tree, middle = cKDTree(np.column_stack([u, v])), np.array([[outline.x], [outline.y]])
-    known = tree.query((rim + middle).T)[0] < _REACH * spacing
-    nodes, shares = np.polynomial.legendre.leggauss(_NODES)
-    inwards = depth * (nodes + 1) / 2
-    triangles = np.abs(ends[0, :-1] * ends[1, 1:] - ends[1, :-1] * ends[0, 1:]) / 2
-    shares = (1 - inwards) * depth * shares * _fading(inwards / depth)
-    at = (rim[:, :, np.newaxis] * (1 - inwards)).reshape(2, -1) + middle
-    near = tree.query(at.T, _AROUND)[1]
-    places = (u[near] - at[0, :, np.newaxis]) + 1j * (v[near] - at[1, :, np.newaxis])
-    outwards = np.repeat(rim[0] - 1j * rim[1], _NODES)[:, np.newaxis]
-    shares_of = continued(places * outwards / np.abs(outwards) / spacing)
-    area = np.outer(triangles * known, shares).ravel() * np.sum(points[3]) / np.sum(triangles)
-    terms = zernike_values(*fit.disc.scaled(*at), fit.terms) * area
-    parabola, plane = (terms @ np.sum(each * form[near], axis=1) for each in shares_of)
-    nearest = cKDTree((rim + middle).T).query(np.column_stack([x, y]))[1]
-    weights = weights * known[nearest] * _fading((1 - size[strip]) / depth)
-    weighted = zernike_values(*fit.disc.scaled(x, y), fit.terms) * weights
-    # Each mean counts as a value of its own in the integrals, and less in the sums.
-    ends_of = np.arange(len(area) + 1) * _AROUND
-    every = csr_array((shares_of[0].ravel(), near.ravel(), ends_of), (len(area), len(u)))
-    more = terms @ every
-    for row, term in zip(more, weighted, strict=True):
-        row -= np.bincount(group, term[: len(group)], len(u))
-    noise = np.diff(rest, 2).std() / np.sqrt(6 * len(group) / len(u))
-    errors = inverse @ np.column_stack([(parabola - plane) / 2, noise * more])
-    return replace(
-        fit,
-        coefficients=fit.coefficients + inverse @ (parabola - weighted @ rest),
-        covariance=fit.covariance + errors @ errors.T,
-    )
+    points: IntArray
+    along: int
+    together: BoolArray
+    parabola: FloatArray
+    plane: FloatArray
+    sums: FloatArray
 
+    @classmethod
+    def of(
+        cls, places: FloatArray, weights: FloatArray, outline: Aperture, spacing: float,
+        columns: Callable[[FloatArray, FloatArray], FloatArray],
+    ) -> RimStrip | None:  # fmt: skip
+        """Return the strip for sums of ``columns`` (k, n); None for a polygon, or few points.
 
-def _means_along(points: FloatArray, spacing: float) -> tuple[FloatArray, IntArray]:
-    """Return means of successive ``points`` (3, n) [m] half a track long, and whose each is.
+        places: x, y of the points (2, n) [m];  weights: of them (n,);  spacing: of the tracks [m]
+        """
+        from scipy.sparse import csr_array  # these take long to load
+        from scipy.spatial import cKDTree
 
-    The nearest single points may lie on one track. Jumps to another line have no mean.
-    """
-    step = float(np.median(np.hypot(*np.diff(points[:2]))))
-    along = max(int(spacing / 2 / step), 1) if step else 1
-    groups = points[:, : points.shape[1] // along * along].reshape(3, -1, along)
-    together = np.max(np.ptp(groups[:2], axis=2), axis=0) < spacing
-    whose = np.repeat(np.maximum(np.cumsum(together) - 1, 0), along)
-    return np.mean(groups[:, together], axis=2), np.asarray(whose, np.int64)
+        outline = outline.disc if outline.outline == "annulus" else outline
+        ends, rim = _around(outline)
+        depth = _STRIP * spacing / float(np.hypot(*rim).min())
+        size = outline.share_of_rim(*places)
+        points = np.flatnonzero(size > 1 - 2 * depth)
+        if outline.outline == "polygon" or depth >= 0.5 or len(points) < _AROUND:
+            return None
+        near_rim = places[:, points]
+        # The nearest single points may lie on one track: means are half a track long.
+        step = float(np.median(np.hypot(*np.diff(near_rim))))
+        along = max(int(spacing / 2 / step), 1) if step else 1
+        groups = near_rim[:, : len(points) // along * along].reshape(2, -1, along)
+        together = np.max(np.ptp(groups, axis=2), axis=0) < spacing
+        u, v = np.mean(groups[:, together], axis=2)
+        if len(u) < _AROUND:
+            return None
+        tree, middle = cKDTree(np.column_stack([u, v])), np.array([[outline.x], [outline.y]])
+        # Steps along a track may be longer than the distance of the tracks.
+        known = tree.query((rim + middle).T)[0] < _REACH * max(spacing, along * step)
+        nodes, shares = np.polynomial.legendre.leggauss(_NODES)
+        inwards = depth * (nodes + 1) / 2
+        triangles = np.abs(ends[0, :-1] * ends[1, 1:] - ends[1, :-1] * ends[0, 1:]) / 2
+        shares = (1 - inwards) * depth * shares * _fading(inwards / depth)
+        at = (rim[:, :, np.newaxis] * (1 - inwards)).reshape(2, -1) + middle
+        near = tree.query(at.T, _AROUND)[1]
+        away = (u[near] - at[0, :, np.newaxis]) + 1j * (v[near] - at[1, :, np.newaxis])
+        outwards = np.repeat(rim[0] - 1j * rim[1], _NODES)[:, np.newaxis]
+        shares_of = continued(away * outwards / np.abs(outwards) / spacing)
+        area = np.outer(triangles * known, shares).ravel() * np.sum(weights) / np.sum(triangles)
+        begins = np.arange(len(area) + 1) * _AROUND
+        parabola, plane = (
+            columns(*at) * area @ csr_array((v.ravel(), near.ravel(), begins), (len(area), len(u)))
+            for v in shares_of
+        )
+        nearest = cKDTree((rim + middle).T).query(near_rim.T)[1]
+        own = weights[points] * known[nearest] * _fading((1 - size[points]) / depth)
+        return cls(points, along, together, parabola, plane, columns(*near_rim) * own)
+
+    def missed(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what sums over ``values`` (s,) of the points miss (k,), and errors (k, 1 + m)."""
+        means = self._means(values)
+        parabola, plane = self.parabola @ means, self.plane @ means
+        noise = np.diff(values, 2).std() / np.sqrt(6 * self.along)
+        # Each mean counts as a value of its own in the integrals, and less in the sums.
+        more = self.parabola - self.along * self._means(self.sums)
+        errors = np.column_stack([(parabola - plane) / 2, noise * more])
+        return parabola - self.sums @ values, errors
+
+    def _means(self, values: FloatArray) -> FloatArray:
+        """Return means of successive ``values`` (…, s): (…, m)."""
+        whole = len(self.together) * self.along
+        groups = values[..., :whole].reshape(*values.shape[:-1], -1, self.along)
+        return np.asarray(np.mean(groups[..., self.together, :], axis=-1))
 
 
 def _around(outline: Aperture) -> tuple[FloatArray, FloatArray]:

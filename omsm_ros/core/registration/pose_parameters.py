@@ -229,10 +229,6 @@ class Registration:
     noise: float
     before: float
 
-    def uncertainty(self, dof: str) -> float | None:
-        """Return the standard uncertainty of a pose parameter, None if it was not asked for."""
-        return self.spread.get(dof)
-
     def effects(self, points: Placed, systematic: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the effects of pose errors (p, n) and sources (s + 2h, n) on the deviations [m].
 
@@ -288,8 +284,7 @@ class Registration:
         """Return which rows of :meth:`effects` are moves of the part, to first order."""
         fitted, sources = self.moved.shape
         first = fitted + sources - 2 * len(self.held_effects)
-        held = np.arange(first, fitted + sources, 2)
-        return np.asarray([*range(fitted), *held], np.int64)
+        return np.asarray([*range(fitted), *range(first, fitted + sources, 2)], np.int64)
 
     def good(self, first: int, count: int) -> BoolArray:
         """Return which of ``count`` points from ``first`` on, as they are read, are no dust."""

@@ -33,7 +33,7 @@ _MOST_CELLS, _FILLED = 768, 3.5
 # Cells along the distance of two evenly spaced points, so that points move by an eighth of it.
 _FINER = 4
 # Largest width of a single line relative to its length.
-_LINE_WIDTH = 1e-6
+LINE_WIDTH = 1e-6
 
 
 def area_weights(
@@ -71,7 +71,7 @@ def _along_line(x: FloatArray, y: FloatArray) -> FloatArray | None:
     across = np.stack([x - np.mean(x), y - np.mean(y)])
     direction = np.linalg.eigh(across @ across.T)[1]
     width, length = (float(np.ptp(way @ across)) for way in direction.T)
-    if length == 0 or width > _LINE_WIDTH * length:
+    if length == 0 or width > LINE_WIDTH * length:
         return None
     return np.asarray(direction[:, 1] @ across, np.float64)
 

@@ -275,7 +275,11 @@ class QFreeform(CheckedRecord):
         w: ComplexArray = np.asarray(np.add(x, np.multiply(1j, y)) / self.aperture_radius)
         s = np.square(w.real) + np.square(w.imag)
         total = np.zeros((3, *w.shape))
-        for m, (cosines, sines) in self._by_order().items():
+        for m in {abs(t.m) for t in self.terms}:
+            own = [t for t in self.terms if abs(t.m) == m]
+            cosines, sines = ([0.0] * (1 + max(t.n for t in own)) for _ in range(2))
+            for term in own:
+                (sines if term.m < 0 else cosines)[term.n] += term.value
             if m == 0:
                 q, rate = bfs_series(cosines, s)
                 total[0] += s * (1 - s) * q
@@ -290,16 +294,6 @@ class QFreeform(CheckedRecord):
                 total += np.stack(turned)
         total[1:] /= self.aperture_radius
         return total[0], total[1], total[2]
-
-    def _by_order(self) -> dict[int, tuple[list[float], list[float]]]:
-        """Return the coefficients [m] of cosines and sines for each |m|, by degree from 0 on."""
-        found: dict[int, tuple[list[float], list[float]]] = {}
-        for m in {abs(t.m) for t in self.terms}:
-            degrees = 1 + max(t.n for t in self.terms if abs(t.m) == m)
-            found[m] = ([0.0] * degrees, [0.0] * degrees)
-        for term in self.terms:
-            found[abs(term.m)][term.m < 0][term.n] += term.value
-        return found
 
 
 def _angular(

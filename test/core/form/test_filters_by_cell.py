@@ -26,7 +26,8 @@ def test_a_filter_is_the_weighted_mean_of_the_cells_that_are_there():
     values, present = RNG.normal(size=(9, 11)), RNG.random((9, 11)) > 0.3
     cells = cells_of(values, present)
     found = cells.smoothed(values, 4e-4)
-    noise = cells.smoothed_square(np.full((9, 11), 0.04), 4e-4)
+    of_rows, of_columns, total = cells.weights(4e-4)
+    noise = of_rows**2 @ (0.04 * present) @ of_columns**2 / total**2 * present
     rows, columns = np.mgrid[:9, :11]
     alpha = np.sqrt(np.log(2) / np.pi)
     for i in range(9):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from soaked import always, soaked
+from soaked import always
 
 from omsm_ros.core.form.deviation_map import DeviationMap
 from omsm_ros.core.form.part_extents import extents_of_parts
@@ -55,9 +55,11 @@ def test_waves_too_fine_for_any_mean_widen_the_figure(noise):
         assert whole.uncertainty < 0.2 * np.ptp(form)
 
 
-@pytest.mark.parametrize("turns", [60, *soaked(100)])
+@pytest.mark.parametrize("turns", [60, 100])
 def test_a_rolled_edge_beyond_the_last_whole_turn_belongs_to_the_figures(turns):
     """A spiral reaches the rim at one place only; the rest of it is up to a turn further in.
+
+    Points of 100 turns are farther apart along a turn than the turns.
 
     Truth over the whole disc, in closed form: the rms of 500 nm ((r - 0.9 R) / 0.1 R)².
     """
@@ -80,7 +82,7 @@ def test_a_rolled_edge_beyond_the_last_whole_turn_belongs_to_the_figures(turns):
         assert abs(whole.value - 500e-9) <= 2 * whole.uncertainty
         assert whole.uncertainty < 30e-9
         assert abs(rms.value - true) <= 2 * rms.uncertainty
-        assert rms.uncertainty < 0.05 * true
+        assert rms.uncertainty < 0.016 * true
 
 
 def test_a_rolled_edge_on_a_dense_map_is_no_higher_than_it_is():

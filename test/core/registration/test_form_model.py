@@ -95,4 +95,4 @@ def test_a_pose_that_goes_to_and_fro_within_its_uncertainty_stands():
     portion = PointBatch(x, y, height, np.empty((0, len(x))))
     found = register(nominal, lambda: [portion], parse_dofs("auto"), aperture=Aperture(RADIUS))
     for name in POSE_PARAMETERS[:6]:
-        assert abs(found.placement.value(name) - pose[name]) < 3 * found.uncertainty(name)
+        assert abs(found.placement.value(name) - pose[name]) < 3 * found.spread.get(name)

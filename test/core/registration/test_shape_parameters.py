@@ -23,7 +23,7 @@ POSE = Pose(piston=2e-6, tip=3e-4, tilt=-2e-4)
 def fitted(guess, height, asked):
     batch = PointBatch(X, Y, height, np.empty((0, N)))
     found = register(guess, lambda: [batch], asked)
-    return found, {n: external(n, v, found.uncertainty(n)) for n, v in found.placement.shape}
+    return found, {n: external(n, v, found.spread.get(n)) for n, v in found.placement.shape}
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_a_part_away_from_the_origin_has_the_parameters_of_the_one_at_it(guess, 
         batch = PointBatch(X + at[0], Y + at[1], height, np.empty((0, N)))
         one = register(guess, lambda batch=batch: [batch], ("auto", *true))
         assert abs(one.placement.value("x") - at[0]) < 2e-3
-        found[at] = {n: (v, one.uncertainty(n)) for n, v in one.placement.shape}
+        found[at] = {n: (v, one.spread.get(n)) for n, v in one.placement.shape}
     here, away = found.values()
     for name in true:
         value, spread = external(name, *away[name])
@@ -110,7 +110,7 @@ def test_a_declared_placement_is_never_exceeded_and_saves_the_astigmatism(seed):
     batch = PointBatch(X, Y, height + rng.normal(0, 3e-9, N), np.empty((0, N)))
     form = analyse_form(nominal, lambda: [batch], ("auto",), declared=off)
     for name, size in off.items():
-        assert form.registration.uncertainty(name) <= size * (1 + 1e-9)
+        assert form.registration.spread.get(name) <= size * (1 + 1e-9)
     place = form.zernike.terms.index(ZernikeIndex(2, 2))
     astigmatism = form.zernike.coefficients[place]
     spread = form.zernike.uncertainty[place]

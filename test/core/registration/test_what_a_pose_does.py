@@ -45,7 +45,7 @@ def test_a_scan_in_portions_is_the_scan(found):
     again = register(PAPER_MIRROR, lambda: [portion(cut) for cut in cuts], NAMES)
     for name in NAMES:
         assert again.placement.value(name) == pytest.approx(found.placement.value(name), rel=1e-9)
-        assert again.uncertainty(name) == pytest.approx(found.uncertainty(name), rel=1e-6)
+        assert again.spread.get(name) == pytest.approx(found.spread.get(name), rel=1e-6)
     assert again.noise == pytest.approx(found.noise)
 
 
@@ -64,7 +64,7 @@ def test_effects_of_the_pose_add_up_to_its_covariance(found, points):
     np.testing.assert_allclose(np.sum(pose**2, axis=0), expected, rtol=1e-6)
     assert sources.shape == (0, len(points.x))
     spread = np.sqrt(np.diag(covariance))
-    assert [found.uncertainty(name) for name in NAMES] == pytest.approx(list(spread))
+    assert [found.spread.get(name) for name in NAMES] == pytest.approx(list(spread))
 
 
 def test_what_the_pose_may_be_off_by_displaces_the_places_of_the_part(found, points):
@@ -99,13 +99,13 @@ def test_a_machine_whose_zero_is_elsewhere_finds_the_part_elsewhere(found):
     for name in NAMES:
         expected = found.placement.value(name) + away.get(name, 0.0)
         # Parts are expected within a millimetre of their place, which draws by a part of that.
-        assert there.placement.value(name) == pytest.approx(expected, abs=found.uncertainty(name))
+        assert there.placement.value(name) == pytest.approx(expected, abs=found.spread.get(name))
 
 
 def test_a_smaller_aperture_knows_the_tilts_less_well(found):
     inner = register(PAPER_MIRROR, lambda: [portion()], NAMES, aperture=Aperture(5e-3))
     for name in ("tip", "tilt", "x", "y"):
-        assert inner.uncertainty(name) > found.uncertainty(name)
+        assert inner.spread.get(name) > found.spread.get(name)
     assert inner.disc == Aperture(5e-3)
 
 
