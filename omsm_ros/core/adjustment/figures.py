@@ -171,7 +171,7 @@ def effects_on_form(made: FormOf) -> dict[str, Effect]:
     # Which forms are probable counts once only, where the form is compared with each family.
     bands = dict.fromkeys(solution.scales.bands, FREE_M**2)
     scales, found = replace(solution.scales, bands=bands), {}
-    any_part = solve(solution.network, solution.y, scales, solution.sizes)
+    any_part = solve(solution.network, solution.y, scales, solution.sizes, solution)
     for family in solution.network.families:
         if family.name not in solution.sizes:
             continue

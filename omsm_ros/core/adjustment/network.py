@@ -176,10 +176,6 @@ class Network:
                 made[row, column] += matrix[top, left] / scales.noise[k]
         return made
 
-    def right_side(self, scales: Scales, y: FloatArray) -> FloatArray:
-        """Return XᵀV⁻¹y with the cells eliminated, (size,)."""
-        return self.sums_by_column(self.pulled(scales, y))
-
     def pulled(self, scales: Scales, y: FloatArray) -> FloatArray:
         """Return V⁻¹y with the cells eliminated, (b,) [1/m]."""
         return np.asarray(self.weights(scales) * (y - self.cells_of(scales, y)[self.part.cell]))
@@ -215,14 +211,10 @@ class Network:
             made += self.blocks.columns[:, here] @ parameters[here]
         return made
 
-    def column(self, name: str) -> FloatArray:
-        """Return the columns of family ``name``, (b, size)."""
-        return np.asarray(self.blocks.columns[:, self.place[name]])
-
     def effect(self, name: str, values: FloatArray, covariance: FloatArray) -> tuple[float, float]:
         """Return what ``values`` (size,) of family ``name`` do to the heights, rms over the points,
         and its standard uncertainty by ``covariance`` (size, size) [m]."""
-        columns = self.column(name)
+        columns = self.blocks.columns[:, self.place[name]]
         power = (columns * self.blocks.count[:, np.newaxis]).T @ columns / self.blocks.count.sum()
         square = np.array([values @ power @ values, np.sum(power * covariance)])
         effect, uncertainty = np.sqrt(np.maximum(square, 0.0))
@@ -384,9 +376,15 @@ class Solution:
         return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance_of(here)), 0.0)))
 
 
-def solve(network: Network, y: FloatArray, scales: Scales, sizes: Sizes) -> Solution:
-    """Return the solution for given scales and prior sizes of the families that take part."""
-    matrix, right = network.normal_matrix(scales), network.right_side(scales, y)
+def solve(
+    network: Network, y: FloatArray, scales: Scales, sizes: Sizes, like: Solution | None = None
+) -> Solution:
+    """Return the solution for given scales and prior sizes of the families that take part.
+
+    like: of the same cells and noise, whose normal equations are not made anew
+    """
+    matrix = like.matrix if like else network.normal_matrix(scales)
+    right = like.right if like else network.sums_by_column(network.pulled(scales, y))
     active = np.flatnonzero(network.active(sizes))
     inside = matrix[np.ix_(active, active)]
     network.add_prior(inside, active, scales, sizes)

@@ -149,7 +149,7 @@ def _released(
         # As large as it was found, if that is more than plausible.
         size = max(family.wide, float(np.sqrt(np.mean(best.values**2))))
         solution = settled(
-            solve(network, y, solution.scales, {**solution.sizes, family.name: size}),
+            solve(network, y, solution.scales, {**solution.sizes, family.name: size}, solution),
             _FURTHER_STEPS,
         )
         steps.append(solution)
@@ -296,4 +296,4 @@ def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Sol
             share = explained(other, refutation.evidence)
             name, size = other.family.name, np.sqrt(share) * np.abs(other.values)
             sizes[name] = np.maximum(sizes.get(name, 0.0), size)
-    return solve(solution.network, solution.y, solution.scales, sizes)
+    return solve(solution.network, solution.y, solution.scales, sizes, solution)

@@ -38,6 +38,10 @@ def dense_rows(network):
     return np.stack([network.fitted(row) for row in np.eye(network.size)], axis=1)
 
 
+def columns_of(network, name):
+    return network.blocks.columns[:, network.place[name]]
+
+
 def test_eliminated_cells_equal_generalised_least_squares(small):
     """N = XᵀV⁻¹X with V = diag(noise) + s² for two blocks of one cell."""
     _, network, _ = small
@@ -52,7 +56,9 @@ def test_eliminated_cells_equal_generalised_least_squares(small):
     y = network.blocks.deviation
     right = rows.T @ np.linalg.solve(v, y) * scale
     np.testing.assert_allclose(
-        network.right_side(scales, y) * scale, right, atol=1e-7 * np.max(np.abs(right))
+        network.sums_by_column(network.pulled(scales, y)) * scale,
+        right,
+        atol=1e-7 * np.max(np.abs(right)),
     )
 
 
@@ -85,7 +91,7 @@ def test_blocks_are_means_of_points(small):
             assert blocks.deviation[first + k] == pytest.approx(
                 np.mean(view.deviation[part]), abs=1e-15
             )
-            assert network.column("lag_change")[first + k, 0] == pytest.approx(
+            assert columns_of(network, "lag_change")[first + k, 0] == pytest.approx(
                 np.mean(view.motion_rate[part]), rel=1e-3, abs=1e-8
             )
         first += len(edges) - 1
@@ -137,7 +143,7 @@ def test_score_of_a_family_equals_its_fit(small):
     _, network, sizes = small
     scales = start_scales(network, 1e-9)
     family = next(f for f in network.families if f.name == "spindle_axial/6")
-    y = network.blocks.deviation + network.column(family.name) @ np.array([4e-9, -3e-9])
+    y = network.blocks.deviation + columns_of(network, family.name) @ np.array([4e-9, -3e-9])
     without = solve(network, y, scales, sizes)
     evidence = evidence_of(without, family)
     free = solve(network, y, scales, {**sizes, family.name: 1e-3})
@@ -280,7 +286,7 @@ def test_a_declaration_that_the_scans_speak_against_may_be_wrong(small, evidence
     _, network, sizes = small
     scales = start_scales(network, 1e-10)
     family = next(f for f in network.families if f.name == "drift_rate")
-    column = network.column("drift_rate")[:, 0]
+    column = columns_of(network, "drift_rate")[:, 0]
 
     def solved(rate):
         return solve(network, rate * column, scales, sizes)
