@@ -56,9 +56,11 @@ def missing_evidence(
     scans: Sequence[StudiedScan], own: int, line: SpectralLine, kinds: set[str]
 ) -> Notice:
     """Return the measurement that would decide between the remaining ``kinds``."""
-    scan = scans[own]
-    others = [s for k, s in enumerate(scans) if k != own]
-    if not any(_other_pace(scan, s, line) for s in others):
+    scan, paces = scans[own], scans[own].coordinates
+    others = [s.coordinates for k, s in enumerate(scans) if k != own]
+    shared = [(paces[n].pace, s[n].pace) for s in others for n in line.possible
+              if n != TIME and n in s]  # fmt: skip
+    if not any(abs(here - there) > _SAME_PACE * here for here, there in shared):
         scan_needed = Notice("ripple.second_scan")
     elif PART in kinds or SYNCHRONOUS in kinds:
         scan_needed = Notice("ripple.further_scan")
@@ -67,15 +69,6 @@ def missing_evidence(
     if scan.acceleration_lines is None:
         return Notice("ripple.needs_scan_or_accelerometer", scan=scan_needed)
     return Notice("ripple.needs_scan", scan=scan_needed)
-
-
-def _other_pace(scan: StudiedScan, other: StudiedScan, line: SpectralLine) -> bool:
-    for name in line.possible:
-        if name != TIME and name in other.coordinates:
-            here, there = scan.coordinates[name].pace, other.coordinates[name].pace
-            if abs(here - there) > _SAME_PACE * here:
-                return True
-    return False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

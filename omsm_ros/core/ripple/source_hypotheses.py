@@ -318,7 +318,10 @@ def _sources(
         )
         if decisive:
             found.append(replace(one, partners=decisive))
-    return tuple(_least_aliased(found))
+    # Of sources with one vibration, that in most scans, then of lowest frequency.
+    shaken = [c for c in found if c.kind == VIBRATION]
+    best = sorted(shaken, key=lambda c: (-len(c.partners), c.frequency))[:1]
+    return (*[c for c in found if c.kind != VIBRATION], *best)
 
 
 def _is_rival(one: SourceHypothesis, other: SourceHypothesis) -> bool:
@@ -326,15 +329,6 @@ def _is_rival(one: SourceHypothesis, other: SourceHypothesis) -> bool:
     if one.kind == SYNCHRONOUS and other.coordinate == PATH:
         return False  # on circles of one radius form of the part repeats in the same way
     return one.kind != other.kind and not other.alias_count
-
-
-def _least_aliased(found: list[SourceHypothesis]) -> list[SourceHypothesis]:
-    """Return the sources with one vibration: the one in most scans, then of lowest frequency."""
-    shaken = [c for c in found if c.kind == VIBRATION]
-    if not shaken:
-        return found
-    best = min(shaken, key=lambda c: (-len(c.partners), c.frequency))
-    return [c for c in found if c.kind != VIBRATION] + [best]
 
 
 def _images(

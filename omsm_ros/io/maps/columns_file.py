@@ -185,19 +185,11 @@ def _columns(
                 )
     stated = {role: unit for role, (_, unit) in named.items() if unit is not None}
     scales = dict.fromkeys(places, 1.0)
-    for role in places:
-        if role == "sample":
-            continue
-        if role in stated:
-            scales[role] = stated[role]
-            if units is not None:
-                own = (
-                    (stated[role], units.height) if role in "xy" else (units.lateral, stated[role])
-                )
-                refuse_other(units, LengthUnits(*own), what)
-        else:
-            given = needed(units, what)
-            scales[role] = given.lateral if role in "xy" else given.height
+    for role in places.keys() - {"sample"}:
+        side = "lateral" if role in "xy" else "height"
+        if role in stated and units is not None:
+            refuse_other(units, replace(units, **{side: stated[role]}), what)  # type: ignore[arg-type]
+        scales[role] = stated[role] if role in stated else getattr(needed(units, what), side)
     return places, scales, count
 
 
@@ -329,13 +321,9 @@ def has_dabam_header(path: Path) -> bool:
     if path.suffix.lower() != ".dat" or header_path == path or not header_path.is_file():
         return False
     try:
-        return "FILE_FORMAT" in _header(header_path)
+        return "FILE_FORMAT" in load_object(header_path, "header", _MAX_HEADER_BYTES)
     except FileError:
         return False
-
-
-def _header(path: Path) -> dict[str, Any]:
-    return load_object(path, "header", _MAX_HEADER_BYTES)
 
 
 def read_dabam(path: Path) -> MeasuredPoints:
@@ -344,7 +332,7 @@ def read_dabam(path: Path) -> MeasuredPoints:
     Raises FileError if columns and header do not agree.
     """
     what = f"profile {str(path)!r}"
-    header = _header(path.with_suffix(".txt"))
+    header = load_object(path.with_suffix(".txt"), "header", _MAX_HEADER_BYTES)
     form, skip = header.get("FILE_FORMAT"), header.get("FILE_HEADER_LINES")
     factors = [header.get(key) for key in ("X1_FACTOR", "Y1_FACTOR")]
     numbers = [n for n in factors if isinstance(n, float | int) and n != 0]

@@ -112,19 +112,14 @@ def write_grid_sag(path: Path, grid: HeightGrid) -> None:
             f"a grid sag file has 5 × 5 points or more, this map {columns} × {rows}; "
             "give a smaller --spacing"
         )
-    slope_x, slope_y, twist = _derivatives(grid)
-    missing = ~np.isfinite(grid.height)
-    parts = [np.where(missing, 0.0, grid.height), slope_x, slope_y, twist, missing]
+    slope_y, slope_x = np.gradient(grid.height, grid.dy, grid.dx)
+    twist, missing = np.gradient(slope_x, grid.dy, axis=0), ~np.isfinite(grid.height)
+    # Derivatives are central differences, zero next to missing points.
+    own = [np.nan_to_num(part, nan=0.0) for part in (slope_x, slope_y, twist)]
+    parts = [np.where(missing, 0.0, grid.height), *own, missing]
     table = np.column_stack([np.flipud(part).ravel() for part in parts])
     centre = (grid.x0 + grid.dx * (columns - 1) / 2, grid.y0 + grid.dy * (rows - 1) / 2)
     head = (columns, rows, *(f"{v:.17g}" for v in (grid.dx, grid.dy)), _METRES)
     with atomic_file(path, "w") as stream:
         stream.write(" ".join(map(str, (*head, *(f"{v:.17g}" for v in centre)))) + "\n")
         np.savetxt(stream, table, fmt=["%.17g", "%.9g", "%.9g", "%.9g", "%d"])
-
-
-def _derivatives(grid: HeightGrid) -> tuple[FloatArray, ...]:
-    """Return slopes and twist by central differences; zero next to missing points."""
-    slope_y, slope_x = np.gradient(grid.height, grid.dy, grid.dx)
-    twist = np.gradient(slope_x, grid.dy, axis=0)
-    return tuple(np.nan_to_num(part, nan=0.0) for part in (slope_x, slope_y, twist))

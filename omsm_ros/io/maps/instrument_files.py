@@ -10,6 +10,7 @@ import re
 import struct
 import warnings
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from datetime import datetime, timezone
@@ -119,7 +120,10 @@ def _datx(h5py: Any, content: Any, channel: str | None, what: str) -> MeasuredPo
     no_data = surface.attrs.get("No Data")
     if no_data is not None:
         height[height >= float(np.ravel(no_data)[0])] = np.nan
-    pixels = [_pixel(surface, f"{axis} Converter") for axis in "XY"]
+    # The second number of a converter from pixels is their distance.
+    converters = [np.ravel(surface.attrs[f"{axis} Converter"])[0] for axis in "XY"]
+    known = all((c[0], c[1]) == (b"LateralCat", b"Pixels") for c in converters)
+    pixels = [float(c[-1][1]) if known else np.nan for c in converters]
     notes = (channel_note(names, chosen),) if len(names) > 1 else ()
     return _of_pixels(height * _datx_scale(surface, what), pixels, what).points(notes)
 
@@ -134,12 +138,6 @@ def _datx_scale(surface: Any, what: str) -> float:
         raise FileError(f"{what} has heights in {name!r}, expected a length or fringes")
     keys = ("Wavelength", "Interferometric Scale Factor", "Obliquity Factor")
     return float(np.prod([np.ravel(surface.attrs[key])[0] for key in keys]))
-
-
-def _pixel(surface: Any, key: str) -> float:
-    """Return the distance of pixels [m]: the second number of a converter from pixels, or NaN."""
-    category, base, *_, numbers = np.ravel(surface.attrs[key])[0]
-    return float(numbers[1]) if (category, base) == (b"LateralCat", b"Pixels") else np.nan
 
 
 def write_hdf5(path: Path, columns: Mapping[str, NDArray[np.generic]], comment: str) -> None:
@@ -264,6 +262,35 @@ _UPWARDS = ("SDFReader", "XYZReader", "NCReader")
 _LARGEST_PIXEL_M = 1e-3
 
 
+_SUR_PACKED, _SUR_PLAIN, _SUR_HEADER_BYTES = b"DSCOMPRESSED", b"DIGITAL SURF", 512
+
+
+def unpacked_sur(path: Path, what: str) -> io.BytesIO | None:
+    """Return a compressed map of Digital Surf as an uncompressed one; None for another file.
+
+    After its header and two texts follow the number of streams of zlib, their sizes unpacked and
+    packed, and the streams. Raises FileError if they are damaged or unpack to another size.
+    """
+    with open_regular(path, FileError, "map") as stream:
+        head = stream.read(_SUR_HEADER_BYTES)
+        if not head.startswith(_SUR_PACKED) or len(head) < _SUR_HEADER_BYTES:
+            return None
+        points = MAP_POINTS.checked(_at("<I", head, 116), FileError, f"{what}: number of points")
+        texts = stream.read(_at("<H", head, 334) + _at("<H", head, 336))
+        try:
+            sizes = stream.read(8 * _at("<I", stream.read(4), 0))
+            parts = [
+                zlib.decompressobj().decompress(stream.read(packed), size + 1)
+                for size, packed in struct.iter_unpack("<2I", sizes)
+                if size <= 4 * points
+            ]
+        except (struct.error, zlib.error) as err:
+            raise FileError(f"{what} is damaged or cut short; save it again") from err
+    if (held := sum(map(len, parts))) != points * _at("<H", head, 98) // 8:
+        raise FileError(f"{what} unpacks to {held} bytes for {points} points; save it again")
+    return io.BytesIO(b"".join([_SUR_PLAIN, head[len(_SUR_PLAIN) :], texts, *parts]))
+
+
 def read_foreign(
     path: Path, units: LengthUnits | None, channel: str | None = None
 ) -> MeasuredPoints:
@@ -289,7 +316,7 @@ def _by_topography(
     with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         try:
-            opened = topography.open_topography(str(path))
+            opened = topography.open_topography(unpacked_sur(path, what) or str(path))
         except topography.Exceptions.CannotDetectFileFormat as err:  # a list of all its readers
             raise FileError(
                 f"{what} is damaged or cut short, or none of the formats that SurfaceTopography "

@@ -2,8 +2,10 @@
 
 import os
 import signal
+import struct
 import sys
 import time
+import zlib
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -12,6 +14,7 @@ import pytest
 
 from omsm_ros.errors import FileError
 from omsm_ros.io import child_process
+from omsm_ros.io.maps.instrument_files import unpacked_sur
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.units import LengthUnits
 
@@ -145,5 +148,50 @@ def test_a_library_that_takes_too_much_or_crashes_is_ended(map_of, monkeypatch, 
     monkeypatch.setattr(sys.modules["SurfaceTopography"], "open_topography", deed)
     if "1 s" in reported:
         monkeypatch.setattr(child_process, "_FILE_S", 0.2)
+    with pytest.raises(FileError, match=reported):
+        read_points(path)
+
+
+def sur_of(heights, streams=1, magic=b"DSCOMPRESSED", claimed=None):
+    """Return a map of Digital Surf by its public layout, whole numbers of four bytes."""
+    head = bytearray(512)
+    head[:12] = magic
+    struct.pack_into("<H", head, 98, 32)
+    struct.pack_into("<3i", head, 108, *reversed(heights.shape), heights.size)
+    struct.pack_into("<2H", head, 334, 5, 2)
+    raw = heights.astype("<i4").tobytes()
+    if magic == b"DIGITAL SURF":
+        return bytes(head) + b"textsPR" + raw
+    parts = [raw[k * len(raw) // streams : (k + 1) * len(raw) // streams] for k in range(streams)]
+    packed = [zlib.compress(part) for part in parts]
+    each = zip(parts, packed, strict=True)
+    sizes = [struct.pack("<2I", claimed or len(part), len(zipped)) for part, zipped in each]
+    return bytes(head) + b"textsPR" + struct.pack("<I", streams) + b"".join([*sizes, *packed])
+
+
+@pytest.mark.parametrize("streams", [1, 3])
+def test_a_compressed_map_of_digital_surf_is_read_as_the_uncompressed_one(tmp_path, streams):
+    heights, path = np.arange(600).reshape(20, 30), tmp_path / "map.sur"
+    path.write_bytes(sur_of(heights, streams))
+    found = unpacked_sur(path, "map")
+    assert found.getvalue() == sur_of(heights, magic=b"DIGITAL SURF")
+    path.write_bytes(found.getvalue())
+    assert unpacked_sur(path, "map") is None
+
+
+@pytest.mark.parametrize(
+    ("content", "reported"),
+    [
+        (sur_of(np.arange(600).reshape(20, 30))[:-40], "unpacks to"),
+        (sur_of(np.arange(600).reshape(20, 30))[:521], "damaged or cut short"),
+        (sur_of(np.arange(600).reshape(20, 30))[:540] + b"\xff" * 400, "damaged or cut short"),
+        (sur_of(np.zeros((1, 1_000_000)), claimed=400)[:112] + struct.pack("<2i", 1, 100)
+         + sur_of(np.zeros((1, 1_000_000)), claimed=400)[120:], "unpacks to 401 bytes for 100"),
+        (sur_of(np.arange(600).reshape(20, 30))[:116] + b"\xff" * 400, "number of points"),
+    ],
+)  # fmt: skip
+def test_a_damaged_one_or_a_bomb_is_refused_in_one_sentence(map_of, content, reported):
+    path = map_of()
+    path.write_bytes(content)
     with pytest.raises(FileError, match=reported):
         read_points(path)
