@@ -113,10 +113,10 @@ def undetected_terms(
     steady = [_STEADY_DRIFT]
     for gone in [steady, drift, [*steady, *drift]] if drift else [steady]:
         # The size that the test would miss stays that of the fit, whose drift is free.
-        for i, (term, other) in enumerate(
-            zip(relaxations, with_drift_as_noise(slow, gone).creep, strict=True)
-        ):
-            size, uncertainty = float(other.score.size[0]), other.score.uncertainty
+        space = with_drift_as_noise(slow, gone).space
+        for i, (term, test) in enumerate(zip(relaxations, slow.creep, strict=True)):
+            score = space.score(test.term.columns[:, :1], CREEP)
+            size, uncertainty = float(score.size[0]), score.uncertainty
             if np.hypot(size, uncertainty) < term.carried:
                 relaxations[i] = replace(term, size=size, uncertainty=uncertainty)
     known = [term for term in relaxations if np.isfinite(term.uncertainty)]
