@@ -8,6 +8,7 @@ G(0) = 1.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -165,7 +166,7 @@ class Fit:
         """Number of samples compared."""
         return len(self.residual)
 
-    @property
+    @cached_property
     def sum_of_squares(self) -> float:
         """Sum of the squared residual [m²]."""
         return float(self.residual @ self.residual)
@@ -175,7 +176,7 @@ class Fit:
         """Root mean square of the residual [m]."""
         return float(np.sqrt(self.sum_of_squares / self.samples))
 
-    @property
+    @cached_property
     def dynamics(self) -> TransferFunction:
         """G(s) with G(0) = 1."""
         return self.scaled.transfer_function(self.nonlinear, self.numerator)
