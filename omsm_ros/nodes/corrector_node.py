@@ -307,6 +307,12 @@ class CorrectorNode(ManagedNode):
             self._publish(self._corrector.finish())
             account = self._state.account(self._corrector)
             self.get_logger().info(f"samples so far: {account.as_dict()}")
+            self._publish_account()
+
+    def _publish_account(self) -> None:
+        state, now_ns = self._state, self.get_clock().now().nanoseconds
+        counts = state.account(self._corrector), state.outside, state.published
+        self._accounts.publish(account_message(self._messages, *counts, now_ns))
 
     def _end_correction(self) -> None:
         self._publish_rest()
@@ -429,10 +435,7 @@ class CorrectorNode(ManagedNode):
             self._verdicts.publish(
                 verdict_message(self._messages, verdict, steps, used.id, accuracy, now_ns)
             )
-        counts, outside = self._state.account(self._corrector), self._state.outside
-        self._accounts.publish(
-            account_message(self._messages, counts, outside, self._state.published, now_ns)
-        )
+        self._publish_account()
         report.values["points_subscribers"] = self._points.get_subscription_count()
         report.values["requests_waiting"] = self._worker.waiting
         if self._frame != self.values["workpiece_frame"]:

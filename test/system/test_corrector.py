@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from certified import certified_by
+from omsm_msgs.msg import Account
 from omsm_msgs.msg import AxisBlock as AxisMessage
 from omsm_msgs.msg import Calibration as CalibrationMessage
 from omsm_msgs.msg import DistanceBlock as DistanceMessage
@@ -17,7 +18,7 @@ from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
 from omsm_ros.io import bags, message_mapping
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.calibration_file import save_calibration
-from omsm_ros.nodes.topics import LATCHED_QOS
+from omsm_ros.nodes.topics import LATCHED_QOS, SAMPLES_QOS
 from omsm_ros.twin.cell import blocks_of
 
 PERIOD, COUNT = 1e-3, 600
@@ -148,8 +149,10 @@ def test_an_overridden_calibration_marks_every_cloud_by_its_frame(cell, true_cal
 def test_what_waits_at_the_end_is_corrected_and_named(cell, true_calibration):
     """The node is asked to end while it stands still and blocks come."""
     cell.processes.start("corrector", calibration=saved(cell, "cal.json", true_calibration))
-    feed = Feed(cell)
+    feed, accounts = Feed(cell), []
+    cell.operator.create_subscription(Account, "/omsm/account", accounts.append, SAMPLES_QOS)
     feed.answer(*blocks())
+    cell.wait("an account", lambda: accounts)
     pid = cell.processes.pid("corrector")
     os.kill(pid, signal.SIGSTOP)
     for number in range(1, 11):
@@ -161,6 +164,8 @@ def test_what_waits_at_the_end_is_corrected_and_named(cell, true_calibration):
     last = said[said.rindex("samples so far: ") :]
     assert last.count(f"'received': {11 * COUNT}") == 2, last
     cell.wait("the last points", lambda: sum(c.width for c in feed.clouds) > 10 * COUNT)
+    cell.wait("the last account", lambda: accounts[-1].axes.received == 11 * COUNT)
+    assert accounts[-1].axes.pending == accounts[-1].distance.pending == 0
 
 
 def test_geometry_parameters_place_the_points(cell, true_calibration):
