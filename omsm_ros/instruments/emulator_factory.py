@@ -81,17 +81,9 @@ class TcpServer:
     def read(self) -> bytes:
         """Return the bytes that the client sent; b"" if none."""
         self._accept()
-        if (client := self._client) is None:
-            return b""
-        try:
-            data = client.recv(_CHUNK_BYTES)
-        except BlockingIOError:
-            return b""
-        except OSError:
-            data = b""
-        if not data:
+        if (data := self._received(_CHUNK_BYTES)) is None:
             self._drop()
-        return data
+        return data or b""
 
     def write(self, data: bytes, stop: threading.Event | None = None) -> int:
         """Send ``data``; return the bytes taken, fewer without a client or after ``stop``."""
@@ -113,7 +105,7 @@ class TcpServer:
                 client, _ = self._listening.accept()
             except OSError:
                 return
-            if not self._gone():
+            if self._received(1, socket.MSG_PEEK) is not None:
                 client.close()
                 continue
             self._drop()
@@ -122,15 +114,14 @@ class TcpServer:
             self._client = client
             self.sessions += 1
 
-    def _gone(self) -> bool:
-        if (client := self._client) is None:
-            return True
+    def _received(self, most: int, flags: int = 0) -> bytes | None:
+        """Return what the client sent, None if it is gone."""
         try:
-            return client.recv(1, socket.MSG_PEEK) == b""
+            return (self._client and self._client.recv(most, flags)) or None
         except BlockingIOError:
-            return False
+            return b""
         except OSError:
-            return True
+            return None
 
     def _drop(self) -> None:
         # Faults on command come from another thread than the one that serves.

@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 
 from omsm_ros import quantities
 from omsm_ros.errors import ConfigurationError, OmsmError, shortened
-from omsm_ros.instruments.emulator import InstrumentFaults, InstrumentLink
+from omsm_ros.instruments.emulator import InstrumentFaults
 from omsm_ros.instruments.emulator_factory import (
     EMULATED,
     AccelerationFeed,
@@ -97,16 +97,9 @@ class CellEmulatorNode(ManagedNode):
             self._disturbances = replace(self._disturbances, reference=ReferenceSensor())
         rates = {f"{p.name.removeprefix('fault_')}_rate": values[p.name] for p in _FAULTS}
         self._link = values["link"] or str(runtime_folder(self.get_namespace()) / "cell")
-        if not self._link.startswith("tcp://"):
-            undo.enter_context(exclusive_lock(Path(self._link)))
-        line: Any = undo.enter_context(line_for(self._link))
-        self._player = player_for(
-            values["device"],
-            line,
-            self._second_line(undo),
-            InstrumentFaults(**rates),
-            values["seed"],
-        )
+        lines = _line(undo, self._link), self._second_line(undo)
+        faults = InstrumentFaults(**rates)
+        self._player = player_for(values["device"], *lines, faults, values["seed"])
         undo.callback(self._player.close)
         for name in _MOTIONS:
             serve(self, undo, Trigger, f"~/{name}", partial(self._on_start, name))
@@ -117,18 +110,14 @@ class CellEmulatorNode(ManagedNode):
         self._feed: AccelerationFeed | None = None
         self.get_logger().info(f"cell at {self._link}, time lapse {values['time_lapse']:g}")
 
-    def _second_line(self, undo: ExitStack) -> InstrumentLink | None:
+    def _second_line(self, undo: ExitStack) -> Any:
         device = self.values["device"]
         if (second := emulated(device).second) is None:
             return None
         link = self.values["link_beside"]
         if second.tcp and not link:
             raise ConfigurationError(f"device {device!r} needs a link_beside: tcp://127.0.0.1:PORT")
-        link = link or f"{self._link}_beside"
-        if not link.startswith("tcp://"):
-            undo.enter_context(exclusive_lock(Path(link)))
-        line: InstrumentLink = undo.enter_context(line_for(link))  # type: ignore[assignment]
-        return line
+        return _line(undo, link or f"{self._link}_beside")
 
     def activate(self, undo: ExitStack) -> None:
         """Accept requests for motions."""
@@ -190,6 +179,12 @@ class CellEmulatorNode(ManagedNode):
         faster = f", {lapse:g} times as fast as the machine" if lapse != 1 else ""
         words = f"playing{faster}" if self._player.playing else "waiting"
         return StateReport(words, {"samples_played": self._player.played, "time_lapse": lapse})
+
+
+def _line(undo: ExitStack, link: str) -> Any:
+    if not link.startswith("tcp://"):
+        undo.enter_context(exclusive_lock(Path(link)))
+    return undo.enter_context(line_for(link))
 
 
 main = partial(run, CellEmulatorNode)

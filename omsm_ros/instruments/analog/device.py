@@ -246,8 +246,7 @@ class AnalogDevice:
             return []
         self._heard = self._monotonic()
         self._decoded += len(volts)
-        waiting = self._waiting if len(self._waiting) else volts[:0]
-        self._waiting = np.concatenate([waiting, volts])
+        self._waiting = np.concatenate([self._waiting.reshape(-1, volts.shape[1]), volts])
         newest = self._first + len(self._waiting) - 1
         self._clock.observe(self._device_ns(newest), self._now_ns())
         size = self._settings.block_size
@@ -261,13 +260,8 @@ class AnalogDevice:
 
     def counts(self) -> dict[str, float]:
         """Return the counts of samples: ``decoded = delivered + pending``; lost, gaps."""
-        return {
-            "decoded": self._decoded,
-            "delivered": self._delivered,
-            "pending": len(self._waiting),
-            "lost": self._lost,
-            "gaps": self._gaps,
-        }
+        names = ("decoded", "delivered", "lost", "gaps")
+        return {name: getattr(self, f"_{name}") for name in names} | {"pending": len(self._waiting)}
 
     def _device_ns(self, number: int) -> int:
         return round(number * self._settings.sample_period * NANOSECONDS_PER_S)
