@@ -12,6 +12,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.streams.statistics import slopes_below
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S, PPM
 
@@ -138,30 +139,13 @@ def _line_below(x: FloatArray, y: FloatArray) -> tuple[float, float, FloatArray]
     delays all arrivals of about a second, so only one rest a second counts.
     """
     drift, uncertainty = _expected_drift(x, y)
-    slopes = np.append(_slopes_below(x, y), drift)
+    slopes = np.append(slopes_below(x, y), drift)
     offsets = np.min(y - slopes[:, np.newaxis] * x, axis=1)
     mean = np.maximum(y.mean() - offsets - slopes * x.mean(), _LEAST_DELAY_S)
     unlikely = ((slopes - drift) / uncertainty) ** 2 / 2
     best = np.argmin(len(x) * _SPAN_S * np.log(mean) + unlikely)
     offset, slope = float(offsets[best]), float(slopes[best])
     return offset, slope, y - slope * x - offset
-
-
-def _slopes_below(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the slopes of the edges of the lower convex hull of the points."""
-    hull: list[tuple[float, float]] = []
-    for k in np.lexsort((y, x)):
-        point = (float(x[k]), float(y[k]))
-        if hull and point[0] == hull[-1][0]:
-            continue
-        while len(hull) > 1 and _slope(hull[-2], point) <= _slope(hull[-2], hull[-1]):
-            hull.pop()
-        hull.append(point)
-    return np.array([*map(_slope, hull[:-1], hull[1:])])
-
-
-def _slope(a: tuple[float, float], b: tuple[float, float]) -> float:
-    return (b[1] - a[1]) / (b[0] - a[0])
 
 
 def _expected_drift(x: FloatArray, y: FloatArray) -> tuple[float, float]:
@@ -217,7 +201,8 @@ class MissedTriggerDetector:
     they return to the line.
 
     resumed: first arrival after the last pause of the trigger [s]
-    lost: triggers may have been missed before a pause, so nothing is confirmed until a restart
+    lost: triggers may have been missed, and arrivals do not show how many, so nothing is confirmed
+        until a restart
     """
 
     def __init__(self, period: float, pause: float = math.inf) -> None:
@@ -247,7 +232,9 @@ class MissedTriggerDetector:
             self._after_pause = _Reference(self._period)
         self._newest = arrival
         if self._after_pause is None:
-            return self._reference.confirms(due, arrival) and not self.lost
+            confirmed = self._reference.confirms(due, arrival)
+            self.lost |= self._reference.lost
+            return confirmed and not self.lost
         if not self._after_pause.confirms(due, arrival):
             return False
         # Its line says nothing of triggers missed before the pause.
@@ -288,6 +275,9 @@ class MissedTriggerDetector:
 
 # Square of the mean resultant length of phases above which arrivals keep step with the trigger.
 _LOCKED = 0.1
+# Arrivals on a grid of a part of a period are as early as before by that part sooner or later. If
+# it is larger than that, one would confirm a sample after a missed trigger.
+_HARMONICS = np.arange(1, round(1 / (1 - _LATE_PERIODS)) + 1)
 # Arrivals later than the earliest of their span by more were delayed [period].
 _EARLY_PERIODS = 2.0
 
@@ -303,7 +293,7 @@ class _Phases:
     def __init__(self, period: float) -> None:
         self._period = period
         self._begin, self._lates = -math.inf, list[float]()  # of the current span
-        self._means: deque[tuple[float, complex]] = deque(maxlen=_LATEST)  # time [s], of a span
+        self._means: deque[tuple[complex, ...]] = deque(maxlen=_LATEST)  # time [s], harmonics
         self.locked = False
 
     def add(self, late: float, arrival: float) -> None:
@@ -316,13 +306,14 @@ class _Phases:
 
     def _end_span(self, late: FloatArray) -> None:
         early = late[late < late.min() + _EARLY_PERIODS]  # a delay says nothing of the age
-        self._means.append((self._begin, complex(np.exp(2j * np.pi * early).mean())))
-        begin, means = np.array(self._means).T
+        self._means.append((self._begin, *np.exp(2j * np.pi * np.outer(_HARMONICS, early)).mean(1)))
+        begin, *means = np.array(self._means).T
         since = (begin - begin[0]).real / self._period
         most = 5 * _DRIFT_SIGMA  # crystals differ by less
-        drifts = np.linspace(-most, most, 2 * math.ceil(2 * most * since[-1]) + 1)
-        common = np.exp(-2j * np.pi * np.outer(drifts, since)) @ means / len(means)
-        self.locked = len(means) > 1 and float(np.max(abs(common)) ** 2) > _LOCKED
+        drifts = np.linspace(-most, most, 8 * math.ceil(2 * most * since[-1]) + 1)
+        turn = np.exp(-2j * np.pi * np.outer(drifts, since))
+        common = [turn**harmonic @ mean for harmonic, mean in zip(_HARMONICS, means, strict=True)]
+        self.locked = len(since) > 1 and (np.max(np.abs(common)) / len(since)) ** 2 > _LOCKED
 
 
 class _Reference:
@@ -485,7 +476,7 @@ def _likelihood(x: FloatArray, y: FloatArray, period: float) -> tuple[float, Flo
     here between ``_WIDTHS``. The two arrivals that define the line do not count.
     """
     drift, uncertainty = (each / period for each in _expected_drift(x, y * period))
-    slopes = np.append(_slopes_below(x, y), drift)
+    slopes = np.append(slopes_below(x, y), drift)
     rests = y - slopes[:, np.newaxis] * x
     rests -= rests.min(axis=1, keepdims=True)
     late = np.sort(rests, axis=1)[:, 2:, np.newaxis]

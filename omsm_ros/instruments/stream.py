@@ -221,17 +221,32 @@ class StreamDevice:
                 "this driver again"
             )
         if self._cutter.unconfirmed:
-            return (
-                f"{self._transport.name}: all samples arrive late, as after missed triggers or at "
-                "another rate, or too unevenly to show missed ones, and are withheld: if this "
-                "lasts, check sample_period, then restart the counters of both devices together"
-            )
+            return f"{self._transport.name}: {self._doubt()}"
         if self._cutter.wrong_rate:
             return (
                 f"{self._transport.name} measures at {self._rates()}; its samples are withheld: "
                 "set sample_period to the device's"
             )
         return ""
+
+    def _doubt(self) -> str:
+        """Return why arrivals confirm no samples, and the remedy."""
+        if self._cutter.detector and self._cutter.detector.lost:
+            return (
+                "triggers were missed, or may have been, and arrivals do not show how many, so "
+                "samples are withheld: restart the counters of both devices together"
+            )
+        if not self._cutter.delivered:
+            return (
+                "samples arrive too unevenly to show a missed trigger and are withheld: relieve "
+                "this computer, let the device send each sample at once, or its time with it, or "
+                "let one device latch probe and axes"
+            )
+        return (
+            "all samples arrive late, as after missed triggers or at another rate, or too unevenly "
+            "to show missed ones, and are withheld: if this lasts, check sample_period, then "
+            "restart the counters of both devices together"
+        )
 
     @property
     def caution(self) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +28,8 @@ from omsm_ros.instruments.six_channel.device import (
     StreamSettings,
 )
 from omsm_ros.instruments.six_channel.protocol import ENCODED_SIZE, FRAME, encode_frames
+
+from .scripted_stream import Script
 
 # `OMSM_MISSED_TRIGGERS=200` tries as many.
 CASES = int(os.environ.get("OMSM_MISSED_TRIGGERS", "1"))
@@ -396,3 +399,55 @@ def test_after_a_pause_of_the_trigger_only_a_doubt_before_it_withholds(
     np.testing.assert_array_equal(counts, triggers)
     assert (counts[-1] > 11_000) == resumes
     assert cutter.unconfirmed != resumes
+
+
+def test_arrivals_on_a_grid_of_half_a_period_do_not_hide_a_missed_trigger() -> None:
+    """A USB frame of 1 ms becomes early enough for the age of a 500 Hz trigger when one is missed.
+
+    Then arrivals are earlier by half a period and later by a period at once.
+    """
+    frame, period, drift, at = 1e-3, 2e-3, -8e-6, 4.2
+    random, detector = np.random.default_rng(3), MissedTriggerDetector(2e-3)
+    polls = np.cumsum(0.005 + abs(random.normal(1e-4, 5e-5, 1200)))
+    first = -drift * at  # the frame at that time is just as old as the trigger
+    counts = np.floor((polls - first) / (period * (1 + drift)))
+    arrivals = np.ceil(polls / frame) * frame
+    confirmed = np.array([
+        detector.confirms(float((count - (poll > at)) * period), UPTIME_S + float(arrival))
+        for count, poll, arrival in zip(counts, polls, arrivals, strict=True)
+    ])  # fmt: skip
+    assert np.any(confirmed & (polls < at))
+    assert not np.any(confirmed & (polls > at))
+
+
+def followed_to(late: Any) -> CsvStreamDevice:
+    """A device of 1 kHz that sent ten lines each 10 ms for 6 s, ``late(taken)`` [s]."""
+    now = [UPTIME_S]
+
+    class Late(Script):
+        def read(self, timeout: float) -> bytes:
+            taken = (count[0] + 10) * PERIOD
+            now[0] = max(now[0], UPTIME_S + taken + late(taken))
+            count[0] += 10
+            return b"".join(b"%d 0 0 0 0 0\n" % k for k in range(count[0] - 10, count[0]))
+
+    count = [0]
+    settings = CsvSettings(columns=COLUMNS, sample_period=PERIOD, block_size=10)
+    device = CsvStreamDevice(Late(), settings, lambda: round(now[0] * 1e9), lambda: now[0])
+    device.open()
+    for _ in range(600):
+        device.poll(0.0)
+    return device
+
+
+def test_samples_that_arrive_too_unevenly_are_withheld_with_the_remedy() -> None:
+    random = np.random.default_rng(4)
+    device = followed_to(lambda taken: random.exponential(0.05))
+    assert device.statistics.delivered == 0 < device.statistics.withheld
+    assert re.search(r"too unevenly .* withheld: .* its time with it", device.trouble)
+
+
+def test_polls_in_step_with_the_trigger_need_a_restart_after_a_missed_one() -> None:
+    device = followed_to(lambda taken: PERIOD * (0.4 + (taken > 3)))
+    assert 2000 < device.statistics.delivered <= 3000
+    assert re.search(r"do not show how many.*restart the counters of both", device.trouble)

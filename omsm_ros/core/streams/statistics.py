@@ -1,4 +1,4 @@
-"""Robust scatter of readings, and an even selection from a stream of unknown length."""
+"""Robust scatter of readings, slopes of a lower hull, and an even selection from a long stream."""
 
 from typing import Any
 
@@ -164,3 +164,20 @@ class EvenSelection:
     def rows(self) -> NDArray[Any]:
         """Return the rows kept so far, in order; a view that is valid until the next are added."""
         return self._room[: len(self)]
+
+
+def slopes_below(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return the slopes of the edges of the lower convex hull of points (n,), in rising order."""
+    hull: list[tuple[float, float]] = []
+    for k in np.lexsort((y, x)):
+        point = u, v = float(x[k]), float(y[k])
+        if hull and u == hull[-1][0]:
+            continue
+        while len(hull) > 1:
+            (a, b), (c, d) = hull[-2:]
+            if (v - b) * (c - a) > (d - b) * (u - a):
+                break
+            hull.pop()
+        hull.append(point)
+    run, rise = np.diff(np.array(hull), axis=0).T
+    return np.asarray(rise / run)
