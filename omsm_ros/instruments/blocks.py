@@ -93,12 +93,9 @@ class BlockCutter:
     period_warnings: full blocks beyond PERIOD_TOLERANCE
     """
 
-    def __init__(
-        self, settings: BlockSettings, channels: Channels, free_running: bool = False
-    ) -> None:
-        """free_running: the device keeps the period itself, so another rate is withheld."""
-        self._settings, self._channels = settings, channels
-        self._free_running = free_running
+    def __init__(self, settings: BlockSettings, channels: Channels, free: bool = False) -> None:
+        """free: the device keeps the period itself, so a block at another rate is withheld."""
+        self._settings, self._channels, self._free = settings, channels, free
         self._clock = DeviceClock()
         self._pending: Samples = np.empty(0, SAMPLE)
         self._first = self._stamp = 0
@@ -106,7 +103,7 @@ class BlockCutter:
         # Without a clock of the device, only arrivals show a trigger that it missed. Channels that
         # one device latches stay together.
         together = channels.distance and channels.axes is not None
-        watched = not (channels.timed or free_running or together)
+        watched = not (channels.timed or free or together)
         period, pause = settings.sample_period, settings.pause
         self.detector = MissedTriggerDetector(period, pause) if watched else None
         # Arrival, the same by the clock of the stamps, whether after a silence.
@@ -136,7 +133,7 @@ class BlockCutter:
         ``arrives_otherwise``.
         """
         if not self._channels.timed:
-            return self._free_running and self.arrives_otherwise
+            return self._free and self.arrives_otherwise
         return self._evenly_wrong
 
     @property
@@ -239,7 +236,7 @@ class BlockCutter:
         after_silence: bool,
     ) -> None:
         """Enter the arrival of the last sample before a restart of the device."""
-        may_pause = not (self._channels.timed or self._free_running or self.detector)
+        may_pause = not (self._channels.timed or self._free or self.detector)
         if runs[0].restarted or (after_silence and may_pause):
             self._clock.restart()
         anew = (i for i, run in enumerate(runs) if i and run.restarted)
@@ -312,7 +309,7 @@ class BlockCutter:
         edges = np.unique(np.linspace(0, periods, _PARTS + 1).astype(int))
         parts = np.diff(samples["time"][edges]) * NANOSECOND_S
         off = parts / np.maximum(np.diff(edges) * self._settings.sample_period, NANOSECOND_S) - 1
-        limit = RATE_TOLERANCE if self._free_running else TRIGGER_TOLERANCE
+        limit = RATE_TOLERANCE if self._free else TRIGGER_TOLERANCE
         self._evenly_wrong = bool(off.min() > limit or off.max() < -limit)
 
     def _blocks(self, samples: Samples, first: int, stamp: int) -> BlockPair:

@@ -197,13 +197,10 @@ class Instrument:
     def step(self, stop: threading.Event | None = None) -> None:
         """Do what is due now: reconnect, answer, measure, send."""
         now = self._clock()
-        if now < self._off_until:
-            self._measure(now)
-            return
-        if self._unplugged:
+        if self._unplugged and now >= self._off_until:
             self._line.plug()
             self._unplugged = False
-        if now < self._quiet_until:
+        if now < max(self._off_until, self._quiet_until):
             self._measure(now)
             return
         try:

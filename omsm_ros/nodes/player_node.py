@@ -384,7 +384,9 @@ class PlayerNode(ManagedNode):
                 )
             if topic in _NEEDED and publisher.get_subscription_count() < self.values["listeners"]:
                 return f"no node subscribes to {name} yet (parameter listeners)"
-            if topic in _NEEDED and (missing := self._missing(name)):
+            there = {info.node_name for info in self.get_subscriptions_info_by_topic(name)}
+            missing = [node for node in self.values["wait_for"].split() if node not in there]
+            if topic in _NEEDED and missing:
                 return (
                     f"{' and '.join(missing)} must subscribe to {name} first (parameter wait_for)"
                 )
@@ -393,10 +395,6 @@ class PlayerNode(ManagedNode):
         if self._listeners.seconds_since_change < (delay := self.values["delay"]):
             return f"it begins {delay:g} s after the last subscriber appeared (parameter delay)"
         return ""
-
-    def _missing(self, name: str) -> list[str]:
-        found = {info.node_name for info in self.get_subscriptions_info_by_topic(name)}
-        return [node for node in self.values["wait_for"].split() if node not in found]
 
     def _publish_next(self) -> None:
         assert self._next is not None
