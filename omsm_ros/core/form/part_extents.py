@@ -31,6 +31,7 @@ from omsm_ros.core.form.part_figures import (
     of_square,
     real_effects,
     with_and_without,
+    without_noise,
 )
 from omsm_ros.core.form.zernike_fit import RimStrip, ZernikeFit, continued, fit_zernikes, separable
 from omsm_ros.core.registration.pose_parameters import root_of
@@ -48,9 +49,6 @@ _ORDERS, _PER_TERM = (30, 16, 12, 8, 4, 2), 40
 _CONDITION = 1e7
 # A hundred points for each term; two thousand show the extent of a smooth form.
 _MOST_FITTED, _MOST_DRAWN = 20_000, 2_000
-# Noise adds to an extent with the first power of its size where many points compete for it, with
-# the second where one has it. The middle is used, the others are limits of a uniform error.
-_POWERS = (1.0, 1.5, 2.0)
 # 200 draws give a standard deviation to 5 %.
 _DRAWS, _SEED = 200, 7
 # Halvings of the cells that show local features, and points at either extreme.
@@ -162,7 +160,7 @@ class _PartForm(NamedTuple):
         for ends, all_, count in shares[: 1 + robust]:
             of_some, *ways = (_extents(way[:count], ends) for way in (form[some], *drawn))
             again, more, likely, full, noise = (way**2 for way in ways)
-            bare, open_ = _without_noise(float(of_some), ways[-1])
+            bare, open_ = without_noise(float(of_some), ways[-1])
             square = bare * abs(bare) - float(np.mean(again - noise) - np.mean(likely) + of_some**2)
             of_bounds, of_taken = (
                 float(np.sqrt(np.mean(v**2))) for v in (more - again, full - np.mean(likely))
@@ -178,16 +176,6 @@ class _PartForm(NamedTuple):
             value = (figure.value or 0.0) + _extents(all_, ends) - of_some + float(np.sum(between))
             found.append(UncertainValue(float(value), length(figure.uncertainty or 0.0, *between)))
         return found[0], found[1] if robust else UncertainValue(None, None), more_square
-
-
-def _without_noise(once: float, again: FloatArray) -> tuple[float, float]:
-    """Return an extent [m] without noise, from extents ``again`` (draws,) with twice the variance.
-
-    It may be negative by chance. Second is the standard uncertainty of the extrapolation [m].
-    """
-    left = [once**p - (np.mean(again**p) - once**p) / (2 ** (p / 2) - 1) for p in _POWERS]
-    found = [float(np.sign(v) * abs(v) ** (1 / p)) for v, p in zip(left, _POWERS, strict=True)]
-    return found[1], float(np.ptp(found)) / np.sqrt(12)
 
 
 def _extents(values: FloatArray, ends: tuple[float, float]) -> FloatArray:
@@ -453,16 +441,21 @@ def _smooth(map_: DeviationMap, disc: Aperture) -> ZernikeFit:
     columns = zernike_values(*disc.scaled(map_.x, map_.y), every) * (root := np.sqrt(map_.area))
     gram, right = columns @ columns.T, columns @ (map_.deviation * root)
     squares = (weighted := columns * root) @ weighted.T
+    hidden = (2 + _CHANCE * np.sqrt(2 / len(map_))) * map_.noise**2  # noise, and form that it hides
+    finer = float(map_.area @ (map_.deviation**2 - hidden))
     for order, lower in zip(orders, [*orders[1:], -1], strict=True):
         terms = [term for term in every if term.n <= order]
         kept = separable(gram[: len(terms), : len(terms)], terms, _CONDITION)
         # Orders that only follow the noise would blur the rim, where the noise of all adds up.
-        solve = np.linalg.inv(gram[np.ix_(kept, kept)])[[terms[k].n > lower for k in kept]]
+        inverse = np.linalg.inv(gram[np.ix_(kept, kept)])
+        new, fitted = [terms[k].n > lower for k in kept], inverse @ right[kept]
+        solve, found, free = inverse[new], fitted[new], sum(new)
         covariance = map_.noise**2 * solve @ squares[np.ix_(kept, kept)] @ solve.T
         # Wald's test, because where the points leave parts of the disc out the terms are alike.
-        free, found = len(solve), solve @ right[kept]
         chi_square = float(found @ np.linalg.solve(covariance + _TINY * np.eye(free), found))
-        if chi_square > free + _CHANCE * np.sqrt(2 * free):
+        # Finer form that they leave, as of rings, swings at the rim: they have to follow most.
+        most = found @ np.linalg.solve(solve[:, new], found) > finer - right[kept] @ fitted
+        if most and chi_square > free + _CHANCE * np.sqrt(2 * free):
             break
     points, known = (map_.x, map_.y, map_.deviation), slice(len(terms))
     sums = gram[known, known], right[known, np.newaxis]

@@ -187,3 +187,18 @@ def short_waves(map_: DeviationMap, cells: GridCells, longest: float) -> Deviati
     """Return the points less the waves of their ``cells`` longer than ``longest`` [m]."""
     low = cells.smoothed_at(map_.x, map_.y, longest)
     return replace(map_, deviation=map_.deviation - low[0], effects=map_.effects - low[1:])
+
+
+# Noise adds to an extent with the first power of its size where many points compete for it, with
+# the second where one has it. The middle is used, the others are limits of a uniform error.
+_POWERS = (1.0, 1.5, 2.0)
+
+
+def without_noise(once: float, again: FloatArray) -> tuple[float, float]:
+    """Return an extent [m] without noise, from extents ``again`` (draws,) with twice the variance.
+
+    It may be negative by chance. Second is the standard uncertainty of the extrapolation [m].
+    """
+    left = [once**p - (np.mean(again**p) - once**p) / (2 ** (p / 2) - 1) for p in _POWERS]
+    found = [float(np.sign(v) * abs(v) ** (1 / p)) for v, p in zip(left, _POWERS, strict=True)]
+    return found[1], float(np.ptp(found)) / np.sqrt(12)
