@@ -275,8 +275,8 @@ class MissedTriggerDetector:
 
 # Square of the mean resultant length of phases above which arrivals keep step with the trigger.
 _LOCKED = 0.1
-# Arrivals on a grid of a part of a period are as early as before by that part sooner or later. If
-# it is larger than that, one would confirm a sample after a missed trigger.
+# Arrivals on a grid of parts of a period are in step with the trigger, too. With parts below
+# 1 - _LATE_PERIODS, a sample after a missed trigger still arrives too late to be confirmed.
 _HARMONICS = np.arange(1, round(1 / (1 - _LATE_PERIODS)) + 1)
 # Arrivals later than the earliest of their span by more were delayed [period].
 _EARLY_PERIODS = 2.0

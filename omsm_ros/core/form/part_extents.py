@@ -453,7 +453,7 @@ def _smooth(map_: DeviationMap, disc: Aperture) -> ZernikeFit:
         covariance = map_.noise**2 * solve @ squares[np.ix_(kept, kept)] @ solve.T
         # Wald's test, because where the points leave parts of the disc out the terms are alike.
         chi_square = float(found @ np.linalg.solve(covariance + _TINY * np.eye(free), found))
-        # Finer form that they leave, as of rings, swings at the rim: they have to follow most.
+        # Finer form that they leave makes them swing at the rim, so they must follow most of it.
         most = found @ np.linalg.solve(solve[:, new], found) > finer - right[kept] @ fitted
         if most and chi_square > free + _CHANCE * np.sqrt(2 * free):
             break
