@@ -191,10 +191,6 @@ class Problem:
         every = np.concatenate([powers * (lag * pulse) for pulse in self._pulses])
         return np.asarray(fft.irfft(every, self.closed_length)[:, : len(self.input)].T)
 
-    def terms(self, structure: Structure) -> int:
-        """Return the number of linear columns that the inputs make."""
-        return sum(count for _, count in self.drives(structure))
-
     def box(self, scaled: ScaledStructure) -> tuple[FloatArray, FloatArray]:
         """Return the bounds of ψ: no pole is faster than the samples can show."""
         lower, upper = scaled.bounds()
@@ -316,7 +312,7 @@ class Problem:
 
     def fit_at(self, scaled: ScaledStructure, at: Projection) -> Fit:
         """Return the fit of a projection."""
-        terms = self.terms(scaled.structure)
+        terms = sum(count for _, count in self.drives(scaled.structure))
         return Fit(scaled, at.nonlinear, at.linear[:terms], at.linear[terms:], at.residual)
 
     def evaluated(self, structure: Structure, nonlinear: FloatArray) -> Fit:

@@ -173,7 +173,9 @@ def identify(
         certificate=certificate_of(evidence, findings, replace(origin, input=input), mass),
         **_further(record, evidence),
     )
-    return Identification(calibration, searched.prepared, best)
+    # A new problem has none of the spectra that fits keep, and can be sent to another process.
+    prepared = replace(searched.prepared, problem=replace(searched.prepared.problem))
+    return Identification(calibration, prepared, best)
 
 
 def _further(record: MotionRecord, evidence: IdentificationEvidence) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Identification against the truth of the twin, and against data that cannot identify."""
 
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -22,6 +23,13 @@ from omsm_ros.twin.cell import Cell, blocks_of, record
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
 from .recorded_motions import TRUTH, errors, from_noise, identified, record_of, recorded, resonance
+
+
+def test_an_identification_can_be_sent_to_another_process():
+    found = identify(record_of(recorded()))
+    received = pickle.loads(pickle.dumps(found))
+    assert received.calibration.id == found.calibration.id
+    assert received.fit.rms == found.fit.rms
 
 
 class TestStepTest:
