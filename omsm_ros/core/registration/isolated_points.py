@@ -29,7 +29,7 @@ _LONG = 3
 # Events of one defect differ in size by less than this factor, unless there is little dust that may
 # meet by chance; reaches between them, with the factor for events that are farther apart.
 _SIMILAR = 2.0
-_SCALES = ((1.0, np.inf), (1.0, _SIMILAR), (3.0, 1.2))
+_SCALES = ((3.0, 1.2), (1.0, np.inf), (1.0, _SIMILAR))
 # A point of a defect is dust beyond this multiple of the usual size of this number of neighbours.
 _DENSE, _AROUND = 1.5, 16
 # A point little beyond the limit is form if this share of the points around is half as far; noise
@@ -100,11 +100,11 @@ class FarPoints:
         form = np.ones(len(index), bool)
         if rule != NO_DUST and len(index):
             space = self.space()
-            event = np.arange(len(index))
+            event = grain = np.arange(len(index))
             if self.path < _MOST_ALONG * space.spacing * self.points and not space.line:
-                event = _events(index, rows[1:], space.reach)
+                event, grain = (_events(rows, space.reach, k) for k in (_SIMILAR, np.inf))
             if rule == ISOLATED:
-                form = _confirmed(event, rows, space, self.points)
+                form = _confirmed(event, grain, rows, space, self.points)
                 for begin in range(0, len(form), _AT_A_TIME):
                     open_ = begin + np.flatnonzero(~form[begin : begin + _AT_A_TIME])
                     form[open_] |= self._like_surroundings(open_, form, event, rows, space)
@@ -154,6 +154,7 @@ class FarPoints:
         are than the dust elsewhere lets expect, the highest: others are form as narrow as tracks.
         """
         from scipy.spatial import cKDTree
+        from scipy.special import pdtrik
 
         if space.line or not np.any(form):
             return form
@@ -163,30 +164,36 @@ class FarPoints:
         # A Poisson number of the points about the form are dust.
         around = float(np.sum(about) + others.shape[1] - len(form))
         expected = float(np.sum(~about)) * around / self.points
-        most = int(expected + _CHANCE * np.sqrt(expected))
-        chosen, steep = np.flatnonzero(form), np.where(form, 0.0, np.abs(rows[3]))
-        size, tree = others[3], cKDTree(others[1:3].T)
-        for begin in range(0, len(chosen), _AT_A_TIME):
-            part = chosen[begin : begin + _AT_A_TIME]
-            away, near = tree.query(
-                rows[1:3, part].T, _AROUND + 1, distance_upper_bound=space.reach
-            )
-            same = (
-                np.where(np.isfinite(away[:, 1:]), np.append(size, 0.0)[near[:, 1:]], 0.0)
-                * np.sign(rows[3, part])[:, np.newaxis]
-            )
-            full, some = (np.isfinite(away[:, k]) for k in (_AROUND, _AROUND // 4))
-            ranked = np.sort(same, axis=1)
-            # The second largest, because two grains may lie side by side where points are dense.
-            largest = np.where(some, ranked[:, -2], ranked[:, -1])
-            level = np.where(full, ranked[:, -_AROUND // 4], _SIMILAR / _DENSE * largest)
-            height = np.abs(rows[3, part])
-            alone = (height - level > self.limit) & (height > _DENSE * level)
-            steep[part] = np.where(alone, height - level, 0.0)
-            about[part[alone & full]] = False
-        steep[~about] = 0.0
-        highest = np.argsort(-steep)[:most]
-        about[highest[steep[highest] > 0]] = False
+        most, rare = int(expected + _CHANCE * np.sqrt(expected)), _BY_CHANCE / max(expected, 1.0)
+        steep, size, tree = np.where(form, 0.0, np.abs(rows[3])), others[3], cKDTree(others[1:3].T)
+        open_ = np.flatnonzero(form)
+        while True:
+            for begin in range(0, len(open_), _AT_A_TIME):
+                part = open_[begin : begin + _AT_A_TIME]
+                away, near = tree.query(
+                    rows[1:3, part].T, _AROUND + 1, distance_upper_bound=space.reach
+                )
+                there = np.isfinite(away[:, 1:])
+                same = np.where(there, np.append(size, 0.0)[near[:, 1:]], 0.0)
+                ranked = np.sort(same * np.sign(rows[3, part])[:, np.newaxis], axis=1)
+                # As many of those around as chance puts beside one are grains too, but not most.
+                beside = np.ceil(pdtrik(1 - rare, space.around(rows[4, part]) * expected / around))
+                beside = np.clip(beside, 0, np.maximum(there.sum(axis=1) // 2 - 1, 0))
+                level = ranked[np.arange(len(part)), -1 - beside.astype(np.int64)]
+                full, height = there[:, -1], np.abs(rows[3, part])
+                level = np.where(full, ranked[:, -_AROUND // 4], _SIMILAR / _DENSE * level)
+                alone = (height - level > self.limit) & (height > _DENSE * level)
+                steep[part] = np.where(alone, height - level, 0.0)
+                about[part[alone & full]] = False
+            steep[~about] = 0.0
+            # The highest first; those beside them are judged without them.
+            highest = np.argsort(-steep)[:most]
+            highest = highest[steep[highest] > np.max(steep) / _SIMILAR]
+            if not len(highest):
+                break
+            about[highest], size[highest], most = False, 0.0, most - len(highest)
+            away, _ = cKDTree(rows[1:3, highest].T).query(rows[1:3].T)
+            open_ = np.flatnonzero(form & about & (away <= space.reach))
         return np.asarray(about)
 
     def space(self) -> _Space:
@@ -223,16 +230,15 @@ class _Space:
         return factor if self.line else factor**2
 
 
-def _events(index: IntArray, rows: FloatArray, reach: float) -> IntArray:
-    """Return the event (k,) of each far point: successive similar ones belong together.
+def _events(rows: FloatArray, reach: float, similar: float) -> IntArray:
+    """Return the event (k,) of each far point: successive ones that are ``similar``.
 
-    rows: x, y, residual and step of the far points (4, k)
+    rows: index, x, y, residual and step of the far points (5, k)
     """
-    residual = rows[2]
     # Steps along a track may be longer than the distance of the tracks.
-    apart = np.hypot(*np.diff(rows[:2])) > np.maximum(reach, _REACH * rows[3, :-1])
-    ratio = residual[1:] / residual[:-1]
-    new = (np.diff(index) > _GAP) | apart | (ratio < 1 / _SIMILAR) | (ratio > _SIMILAR)
+    apart = np.hypot(*np.diff(rows[1:3])) > np.maximum(reach, _REACH * rows[4, :-1])
+    ratio = rows[3, 1:] / rows[3, :-1]
+    new = (np.diff(rows[0]) > _GAP) | apart | (ratio < 1 / similar) | (ratio > similar)
     return np.concatenate([[0], np.cumsum(new)])
 
 
@@ -270,18 +276,31 @@ def _clusters(
     return group[event], float((np.sum(near) + 1) / (len(sizes) * (len(sizes) - 1) / 2 + 1))
 
 
-def _confirmed(event: IntArray, rows: FloatArray, space: _Space, points: int) -> BoolArray:
-    """Return which far points (k,) are form: those of long events, and of large clusters."""
-    begins = np.concatenate([[0], np.flatnonzero(np.diff(event)) + 1])
-    steps = np.where(np.diff(event) == 0, np.hypot(*np.diff(rows[1:3])), 0.0)
-    lengths = np.add.reduceat(np.concatenate([steps, [0.0]]), begins)
-    many = np.bincount(event) >= _LONG
-    form = (many & (lengths > np.maximum(space.reach, rows[4, begins])))[event]
+def _confirmed(
+    event: IntArray, grain: IntArray, rows: FloatArray, space: _Space, points: int
+) -> BoolArray:
+    """Return which far points (k,) are form: those of long events, and of large clusters.
+
+    grain: event (k,) where successive points may differ in size, as those of one grain do
+    """
+    form = np.zeros(len(event), bool)
     for factor, similar in _SCALES:
         wide = replace(space, reach=factor * space.reach, share=space.larger(factor) * space.share)
-        cluster, alike = _clusters(event, rows, wide.reach, similar)
+        one = grain if similar == np.inf else event
+        begins = np.concatenate([[0], np.flatnonzero(np.diff(one)) + 1])
+        cluster, alike = _clusters(one, rows, wide.reach, similar)
         form |= _no_chance(cluster[begins], rows[:, begins], wide, points, alike)[cluster]
-    return np.asarray(form)
+    # A point of the smooth form between far points shows that they are several grains.
+    parted = (np.diff(event) != 0) | (np.diff(rows[0]) > 1)
+    run = np.concatenate([[0], np.cumsum(parted)])
+    count = np.bincount(run)
+    lengths = np.bincount(run[1:], np.where(parted, 0, np.hypot(*np.diff(rows[1:3]))), len(count))
+    # Grains cover no more than two points; several that touch are as frequent as chance makes them.
+    one, two = np.bincount(count[run[~form]], minlength=_LONG)[1:_LONG] / (1, 2)
+    by_chance = two * ((one + two) * alike / points) ** ((count - 1) // 2)
+    long = (count >= _LONG) & (by_chance < _BY_CHANCE)
+    long = long[run] & (lengths[run] > np.maximum(space.reach, rows[4]))
+    return np.asarray(form | np.isin(event, event[long]))
 
 
 def _no_chance(

@@ -174,3 +174,68 @@ def test_two_grains_side_by_side_on_a_rolled_edge_are_dust():
     batch = PointBatch(x, y, height, np.empty((0, len(x))))
     found = register(Flat(), lambda: [batch], ("piston", "tip", "tilt"))
     assert set(found.dust) == set(grains)
+
+
+def spiral_with(grains, form, turns=92, points=50_000):
+    """Register a spiral with a noise of 1 nm and grains, by index; return the dust."""
+    share = np.linspace(1, 0, points)
+    x, y = (R * share * f(2 * np.pi * turns * share) for f in (np.cos, np.sin))
+    height = form(x, y) + np.random.default_rng(3).normal(0, 1e-9, points)
+    height[list(grains)] += list(grains.values())
+    batch = PointBatch(x, y, height, np.empty((0, points)))
+    return set(register(Flat(), lambda: [batch], ("piston", "tip", "tilt")).dust.tolist())
+
+
+def other_grains(points=50_000):
+    """Make dust all over the part, of which every second grain covers two points."""
+    places = range(150, points, 150)
+    sizes = np.random.default_rng(4).permutation(np.geomspace(150e-9, 15e-6, len(places)))
+    grains = dict(zip(places, sizes, strict=True))
+    return grains | {k + 1: 1.2 * grains[k] for k in places[::2]}
+
+
+@pytest.mark.parametrize(
+    ("first", "steps"), [(18_060, (0, 2, 3)), (18_060, (0, 1, 3, 4)), (4060, (0, 1, 2))]
+)
+def test_grains_in_line_are_no_form_along_the_track(first, steps):
+    """They reach over the distance of the tracks; the surface between them is smooth."""
+    chain = {first + k: (500 + 40 * k) * 1e-9 for k in steps}
+    grains = other_grains() | chain
+    assert set(grains) - spiral_with(grains, nothing) == set()
+
+
+def test_two_grains_of_two_points_on_neighbouring_tracks_are_no_form():
+    share = np.linspace(1, 0, 50_000)
+    turn = 2 * np.pi * 92 * share
+    at = 4001
+    beside = int(np.argmin(np.abs(turn - (turn[at] - 2 * np.pi))))
+    pairs = dict(zip((at, at + 1, beside, beside + 1), (0.3e-6, 2e-6, 1.9e-6, 0.4e-6), strict=True))
+    few = {k: v for k, v in other_grains().items() if k % 900 < 2}
+    grains = few | pairs
+    assert set(grains) - spiral_with(grains, nothing) == set()
+
+
+@pytest.mark.parametrize("sizes", [(540e-9, 770e-9, 360e-9), (600e-9, 610e-9, 620e-9)])
+def test_three_grains_side_by_side_on_ripple_do_not_excuse_each_other(sizes):
+    """The ripple is far from the smooth form, and would make them form, too."""
+
+    def ripple(x, y):
+        at = np.hypot(x - 5e-3, y)
+        return 40e-9 * (1 + np.cos(2 * np.pi * at / 0.9e-3)) * (at < 4e-3)
+
+    share = np.linspace(1, 0, 30_000)
+    x, y = (R * share * f(2 * np.pi * 92 * share) for f in (np.cos, np.sin))
+    near = np.argsort(np.hypot(x - 5.9e-3, y))[:3]
+    grains = other_grains(30_000) | dict(zip(near.tolist(), sizes, strict=True))
+    assert not set(near.tolist()) - spiral_with(grains, ripple, points=30_000)
+
+
+def test_a_pit_on_three_tracks_stays_among_much_dust():
+    def pit(x, y):
+        return -400e-9 * np.exp(-((((x - 6e-3) ** 2 + y**2) / 0.25e-3**2) ** 2))
+
+    share = np.linspace(1, 0, 50_000)
+    x, y = (R * share * f(2 * np.pi * 92 * share) for f in (np.cos, np.sin))
+    grains = {k: v for k, v in other_grains().items() if np.hypot(x[k] - 6e-3, y[k]) > 1e-3}
+    found = spiral_with(grains, pit)
+    assert not [k for k in found - set(grains) if pit(x[k], y[k]) < -200e-9]
