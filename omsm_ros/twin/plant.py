@@ -179,7 +179,10 @@ def _zero_order_hold_sections(system: TransferFunction, step: float) -> FloatArr
     Poles are mapped exactly; zeros are those of the Rosenbrock pencil of the discrete system; the
     gain follows from G(0). A single polynomial would lose digits.
     """
-    a, b, c, d = signal.cont2discrete(_state_space(system, step), 1.0, method="zoh")[:4]
+    # Controllable canonical form, time in units of the step to keep its entries near 1.
+    top, bottom = (p / step ** np.arange(len(p)) for p in (system.numerator, system.denominator))
+    canonical = signal.tf2ss(top[::-1], bottom[::-1])
+    a, b, c, d = signal.cont2discrete(canonical, 1.0, method="zoh")[:4]
     n = len(a)
     # y at the end of the step: C x[k+1] + D u[k] = C A x[k] + (C B + D) u[k].
     pencil = np.block([[a, b], [c @ a, c @ b + d]])
@@ -193,12 +196,3 @@ def _zero_order_hold_sections(system: TransferFunction, step: float) -> FloatArr
 
 def _at_one(roots: ComplexArray) -> complex:
     return complex(np.prod(1 - roots))
-
-
-def _state_space(
-    system: TransferFunction, step: float
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return controllable canonical form, time in units of ``step`` to keep its entries near 1."""
-    top, bottom = (p / step ** np.arange(len(p)) for p in (system.numerator, system.denominator))
-    a, b, c, d = signal.tf2ss(top[::-1], bottom[::-1])
-    return a, b, c, d

@@ -54,11 +54,6 @@ NAMES = (*_STATED_RANDOM, *SYSTEMATIC)
 _NO_MEASUREMENT = {"none", "nothing", "unknown", "assumed", "assumption", "guess", "guessed"}
 
 
-def _is_evaluation(text: str) -> bool:
-    """Return whether ``text`` names a measurement: a recording, a command, a report."""
-    return bool(set(re.findall(r"[^\W\d_]{3,}", text.lower())) - _NO_MEASUREMENT)
-
-
 @dataclass(frozen=True, kw_only=True)
 class StatedSource:
     """Statement about one source.
@@ -111,7 +106,8 @@ class StatedSource:
     @property
     def origin(self) -> str:
         """``how``, but DECLARED for an evaluation that does not say from what."""
-        unsaid = self.how == EVALUATED and not _is_evaluation(f"{self.reason} {self.evaluation}")
+        words = re.findall(r"[^\W\d_]{3,}", f"{self.reason} {self.evaluation}".lower())
+        unsaid = self.how == EVALUATED and _NO_MEASUREMENT.issuperset(words)
         return DECLARED if unsaid else self.how
 
     @property

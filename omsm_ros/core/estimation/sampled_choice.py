@@ -121,7 +121,9 @@ def choose_sampled(
         whole = replace(whole, delays=late.delays)
     explored, every, most = _explored(whole, order, most)
     explored, lag = _with_delays(explored, 0)
-    early = replace(explored, records=[_early(record) for record in explored.records])
+    first = (r.used & (_parts(r.used) < _FIRST_PART * _PARTS) for r in explored.records)
+    records = [replace(r, used=u) for r, u in zip(explored.records, first, strict=True)]
+    early = replace(explored, records=records)
     fits, by_order = _explore(early, explored, most, order, lag)
     orders = [fitted.order for fitted in fits]
     best = np.argsort(by_order, kind="stable")[:_FINALISTS]
@@ -236,10 +238,6 @@ def _parts(used: BoolArray) -> FloatArray:
     """Return the place of each used sample in parts, 0 to _PARTS, fractional; -1 elsewhere."""
     place = np.cumsum(used) - 1.0
     return np.asarray(np.where(used, place * _PARTS / max(float(np.sum(used)), 1.0), -1.0))
-
-
-def _early(record: SampledRecord) -> SampledRecord:
-    return replace(record, used=record.used & (_parts(record.used) < _FIRST_PART * _PARTS))
 
 
 def _with_delays(problem: SectionsProblem, most: int) -> tuple[SectionsProblem, SectionsFit]:

@@ -214,10 +214,12 @@ def _by_counter(
         )
     own = replace(trigger, counter_offset=0)
     z, *others = (_filled(row, grid.known) for row in grid.positions)
+    named = zip(further, others, strict=True)
     return MotionRecord(
         sample_period=period,
         z=z,
-        further=dict(zip(further, map(_turned, further, others), strict=True)),
+        # The angle C without its jumps of whole turns.
+        further={name: np.asarray(np.unwrap(v)) if name == "c" else v for name, v in named},
         distance=output,
         ok=grid.known & ok,
         reference=grid.matched("reference", reference, own)[0] if reference else None,
@@ -238,11 +240,6 @@ def _counts(grid: _Grid, probe: StreamAccount) -> dict[str, int]:
         "not_ok": lost.get("invalid", 0),
         "paired": probe.corrected,
     }
-
-
-def _turned(name: str, position: FloatArray) -> FloatArray:
-    """Return ``position`` (n,), an angle C without its jumps of whole turns."""
-    return np.asarray(np.unwrap(position)) if name == "c" else position
 
 
 def _filled(z: FloatArray, known: BoolArray) -> FloatArray:
