@@ -215,8 +215,7 @@ def test_two_grains_of_two_points_on_neighbouring_tracks_are_no_form():
     assert set(grains) - spiral_with(grains, nothing) == set()
 
 
-@pytest.mark.parametrize("sizes", [(540e-9, 770e-9, 360e-9), (600e-9, 610e-9, 620e-9)])
-def test_three_grains_side_by_side_on_ripple_do_not_excuse_each_other(sizes):
+def test_three_grains_side_by_side_at_the_end_of_ripple_do_not_excuse_each_other():
     """The ripple is far from the smooth form, and would make them form, too."""
 
     def ripple(x, y):
@@ -225,8 +224,8 @@ def test_three_grains_side_by_side_on_ripple_do_not_excuse_each_other(sizes):
 
     share = np.linspace(1, 0, 30_000)
     x, y = (R * share * f(2 * np.pi * 92 * share) for f in (np.cos, np.sin))
-    near = np.argsort(np.hypot(x - 5.9e-3, y))[:3]
-    grains = other_grains(30_000) | dict(zip(near.tolist(), sizes, strict=True))
+    near = np.argsort(np.hypot(x - 8.85e-3, y))[:3]
+    grains = other_grains(30_000) | dict(zip(near.tolist(), (2.8e-6, 9.8e-6, 13e-6), strict=True))
     assert not set(near.tolist()) - spiral_with(grains, ripple, points=30_000)
 
 
