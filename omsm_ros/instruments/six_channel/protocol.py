@@ -195,12 +195,9 @@ def row_dtype(columns: Sequence[str]) -> np.dtype[np.void]:
 
 def encode_lines(rows: NDArray[np.void], columns: Sequence[str] = COLUMNS) -> list[bytes]:
     """Return the bytes of each of ``rows`` (n,), which have a field for each column."""
-    lists = [rows[name].tolist() for name in columns]
-    return [(",".join(map(_text, row)) + "\n").encode() for row in zip(*lists, strict=True)]
-
-
-def _text(value: float) -> str:
-    return str(value) if isinstance(value, int) else f"{value:.17g}"
+    lists = (rows[name].tolist() for name in columns)
+    texts = [[str(v) if isinstance(v, int) else f"{v:.17g}" for v in values] for values in lists]
+    return [(",".join(row) + "\n").encode() for row in zip(*texts, strict=True)]
 
 
 class CsvDecoder:
