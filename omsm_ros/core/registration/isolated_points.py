@@ -176,17 +176,17 @@ class FarPoints:
                 there = np.isfinite(away[:, 1:])
                 same = np.where(there, np.append(size, 0.0)[near[:, 1:]], 0.0)
                 ranked = np.sort(same * np.sign(rows[3, part])[:, np.newaxis], axis=1)
-                # As many of those around as chance puts beside one are grains too, but not most.
-                beside = np.ceil(pdtrik(1 - rare, space.around(rows[4, part]) * expected / around))
-                beside = np.clip(beside, 0, np.maximum(there.sum(axis=1) // 2 - 1, 0))
-                level = ranked[np.arange(len(part)), -1 - beside.astype(np.int64)]
+                # As many of those around as chance puts next to one are grains too, but not most.
+                company = np.ceil(pdtrik(1 - rare, space.around(rows[4, part]) * expected / around))
+                company = np.clip(company, 0, np.maximum(there.sum(axis=1) // 2 - 1, 0))
+                level = ranked[np.arange(len(part)), -1 - company.astype(np.int64)]
                 full, height = there[:, -1], np.abs(rows[3, part])
                 level = np.where(full, ranked[:, -_AROUND // 4], _SIMILAR / _DENSE * level)
                 alone = (height - level > self.limit) & (height > _DENSE * level)
                 steep[part] = np.where(alone, height - level, 0.0)
                 about[part[alone & full]] = False
             steep[~about] = 0.0
-            # The highest first; those beside them are judged without them.
+            # The highest first; those near them are judged without them.
             highest = np.argsort(-steep)[:most]
             highest = highest[steep[highest] > np.max(steep) / _SIMILAR]
             if not len(highest):
