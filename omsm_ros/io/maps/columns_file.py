@@ -185,7 +185,7 @@ def _columns(
                 )
     stated = {role: unit for role, (_, unit) in named.items() if unit is not None}
     scales = dict.fromkeys(places, 1.0)
-    for role in places.keys() - {"sample"}:
+    for role in [name for name in places if name != "sample"]:
         side = "lateral" if role in "xy" else "height"
         if role in stated and units is not None:
             refuse_other(units, replace(units, **{side: stated[role]}), what)  # type: ignore[arg-type]
