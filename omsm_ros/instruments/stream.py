@@ -23,8 +23,8 @@ from omsm_ros.units import NANOSECONDS_PER_S
 UNREADABLE_S = 2.0
 # A counter of so few counts misses losses that are likely enough to be stated.
 _SMALL_COUNTER = 16
-# A silent stream is connected once more after this [s] or so many of its periods, then each time
-# that the silence is longer by this part: a device that returns is heard soon.
+# A silent stream is connected once more after this time [s], or this number of its periods if that
+# is longer, then each time the silence has grown by this part: a returned device is heard soon.
 _RENEW_S, _RENEW_PERIODS, _RENEW_PART = 1.0, 5, 0.1
 # Time between two checks of the time-out of an answer [s].
 _ANSWER_S = 0.05

@@ -272,7 +272,7 @@ def silent() -> Iterator[Silent]:
 def test_a_device_that_forgot_its_connection_is_heard_a_second_after_its_return(
     silent: Silent,
 ) -> None:
-    """Nobody serves the connections of the fault; the counter tells what the silence cost."""
+    """The device serves none of its connections before; the counter tells what was lost."""
     served = silent.silent()
     served.sendall(encode_frames(frames_of(list(range(15, 25)))))
     silent.read(20)

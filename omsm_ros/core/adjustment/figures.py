@@ -366,7 +366,7 @@ def places_of(solution: Solution, within: BoolArray | None = None) -> Places:
     # some is scanned too, and they stand for half of it each.
     between = np.roll(number > 0, 1) & (number == 0) & np.roll(number > 0, -1)
     # In each direction the outermost block; within the last turns on to the rim, where a form of
-    # high order has its peaks. What the terms do between them has its uncertainty.
+    # high order has its peaks. The uncertainty of the terms holds on the way there, too.
     u, v = part.disc.scaled(blocks.x, blocks.y)
     out = np.hypot(u, v)
     # Blocks lie in the middle of a sector of the turn; a quarter off, none is near an end.

@@ -361,7 +361,7 @@ class CompressedProblem:
     """A problem by lines of its spectra, or by sums over neighbouring lines for a long record.
 
     Over a few lines G is constant, so that of every signal it needs the part along the input there,
-    one number. What the background explains of the rest is the same for every model.
+    one number. The background explains the same part of the rest for every model.
 
     inputs: of each input (m, k) at s (k,);  fixed: of the background, (q, 2k + q + 1)
     target: of the output, (2k + q + 1,); the last q + 1 are of the rest
@@ -379,8 +379,8 @@ class CompressedProblem:
     def of(cls, problem: Problem, lines: int = 0) -> CompressedProblem:
         """Return ``problem`` by about ``lines`` sums, or by each line if 0 or for several inputs.
 
-        What is not compared is filled in with the output of a model (expectation maximisation,
-        Dempster et al. 1977), here with the static gain.
+        Samples that are not compared are filled in with the output of a model (expectation
+        maximisation, Dempster et al. 1977), here with the static gain.
         """
         static, weights = problem.evaluated(Structure(0, 0, False), np.empty(0)), problem.weights
         columns = np.column_stack([problem.background[problem.used], problem.target])

@@ -441,8 +441,8 @@ def _smooth(map_: DeviationMap, disc: Aperture) -> ZernikeFit:
     columns = zernike_values(*disc.scaled(map_.x, map_.y), every) * (root := np.sqrt(map_.area))
     gram, right = columns @ columns.T, columns @ (map_.deviation * root)
     squares = (weighted := columns * root) @ weighted.T
-    hidden = (2 + _CHANCE * np.sqrt(2 / len(map_))) * map_.noise**2  # noise, and form that it hides
-    finer = float(map_.area @ (map_.deviation**2 - hidden))
+    unresolved = (2 + _CHANCE * np.sqrt(2 / len(map_))) * map_.noise**2  # noise and as much form
+    finer = float(map_.area @ (map_.deviation**2 - unresolved))
     for order, lower in zip(orders, [*orders[1:], -1], strict=True):
         terms = [term for term in every if term.n <= order]
         kept = separable(gram[: len(terms), : len(terms)], terms, _CONDITION)

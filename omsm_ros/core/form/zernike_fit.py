@@ -164,7 +164,7 @@ def fit_zernikes(
 
 
 class RimStrip(NamedTuple):
-    """What sums over points miss of integrals along the rim, where the form is steep.
+    """Difference of integrals along the rim, where the form is steep, from sums over points.
 
     Points there stand for the way to the outline, along which mid-spatial form changes. In a strip
     that fades inwards, integrals of parabolas through neighbouring points replace the sums. Half

@@ -318,7 +318,7 @@ def _sources(
         )
         if decisive:
             found.append(replace(one, partners=decisive))
-    # Of sources with one vibration, that in most scans, then of lowest frequency.
+    # One vibration has one source: the one in most scans, then the one of lowest frequency.
     shaken = [c for c in found if c.kind == VIBRATION]
     best = sorted(shaken, key=lambda c: (-len(c.partners), c.frequency))[:1]
     return (*[c for c in found if c.kind != VIBRATION], *best)

@@ -112,7 +112,7 @@ def test_the_slope_after_elimination_points_downhill():
 @pytest.mark.parametrize("further", [False, True])
 @pytest.mark.parametrize("lines", [0, 1000])
 def test_sums_over_lines_are_those_over_the_compared_samples(further, lines):
-    """What is not compared is filled in with the exact answer; sums of a few lines are close."""
+    """Samples that are not compared have the exact answer; sums of a few lines are close."""
     structure = Structure(2, 1, True)
     problem = problem_of(resonance(60.0, 0.2), noise=1e-8)
     lost = np.random.default_rng(2).random(len(problem.used)) < 0.05

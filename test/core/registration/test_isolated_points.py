@@ -208,8 +208,8 @@ def test_two_grains_of_two_points_on_neighbouring_tracks_are_no_form():
     share = np.linspace(1, 0, 50_000)
     turn = 2 * np.pi * 92 * share
     at = 4001
-    beside = int(np.argmin(np.abs(turn - (turn[at] - 2 * np.pi))))
-    pairs = dict(zip((at, at + 1, beside, beside + 1), (0.3e-6, 2e-6, 1.9e-6, 0.4e-6), strict=True))
+    near = int(np.argmin(np.abs(turn - (turn[at] - 2 * np.pi))))
+    pairs = dict(zip((at, at + 1, near, near + 1), (0.3e-6, 2e-6, 1.9e-6, 0.4e-6), strict=True))
     few = {k: v for k, v in other_grains().items() if k % 900 < 2}
     grains = few | pairs
     assert set(grains) - spiral_with(grains, nothing) == set()
