@@ -67,6 +67,20 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: (item.path.name != "test_soak.py", place[item.path]))
 
 
+@pytest.fixture(scope="module")
+def generators(request):
+    """Random generators of a test file, each with its state before the first test."""
+    own = [g for g in vars(request.module).values() if isinstance(g, np.random.Generator)]
+    return [(g.bit_generator, g.bit_generator.state) for g in own]
+
+
+@pytest.fixture(autouse=True)
+def _same_numbers(generators):
+    """Let a test draw the same numbers, whichever tests run before it."""
+    for generator, state in generators:
+        generator.state = state
+
+
 @pytest.fixture(scope="session")
 def small_scan():
     return scan_of(SMALL)
