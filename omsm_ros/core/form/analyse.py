@@ -263,7 +263,7 @@ def _figures(
     rest_cells = GridCells.of(rest, even=even)
     maps = [map_, best_fit(map_), rest, smooth.without(POWER)]
     extents = extents_of_parts(maps, found.disc, outline, found.spacing)
-    sizes = [rms_of_part(each, extent[2]) for each, extent in zip(maps, extents, strict=True)]
+    sizes = [rms_of_part(maps[k], extents[k][2]) for k in range(3)]
     del maps, rest  # each is as large as the map
     figures = {
         # Irregularity: the peak to valley without piston, tilts and power.

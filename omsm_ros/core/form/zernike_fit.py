@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, zernike_values
 from omsm_ros.errors import DataError
@@ -171,17 +171,14 @@ class RimStrip(NamedTuple):
     the difference to planes is a standard uncertainty, because the next order of a series is one
     that the points do not show; another is the noise of the parabolas.
 
-    points: of the strip (s,);  along: number of successive ones whose mean is one value
-    together: which of these have a mean, for jumps to another line have none
-    parabola, plane: integrals for each mean (k, m);  sums: of the points (k, s)
+    points: of the strip (s,)
+    more: weights of the points in the integrals less those in the sums (k, s)
+    open_: half the weights in the integrals of parabolas less those of planes (k, s)
     """
 
     points: IntArray
-    along: int
-    together: BoolArray
-    parabola: FloatArray
-    plane: FloatArray
-    sums: FloatArray
+    more: FloatArray
+    open_: FloatArray
 
     @classmethod
     def of(
@@ -207,7 +204,7 @@ class RimStrip(NamedTuple):
         step = float(np.median(np.hypot(*np.diff(near_rim))))
         along = max(int(spacing / 2 / step), 1) if step else 1
         groups = near_rim[:, : len(points) // along * along].reshape(2, -1, along)
-        together = np.max(np.ptp(groups, axis=2), axis=0) < spacing
+        together = np.max(np.ptp(groups, axis=2), axis=0) < spacing  # else a jump to another line
         u, v = np.mean(groups[:, together], axis=2)
         if len(u) < _AROUND:
             return None
@@ -223,31 +220,25 @@ class RimStrip(NamedTuple):
         away = (u[near] - at[0, :, np.newaxis]) + 1j * (v[near] - at[1, :, np.newaxis])
         outwards = np.repeat(rim[0] - 1j * rim[1], _NODES)[:, np.newaxis]
         shares_of = continued(away * outwards / np.abs(outwards) / spacing)
-        area = np.outer(triangles * known, shares).ravel() * np.sum(weights) / np.sum(triangles)
-        begins = np.arange(len(area) + 1) * _AROUND
-        parabola, plane = (
-            columns(*at) * area @ csr_array((v.ravel(), near.ravel(), begins), (len(area), len(u)))
-            for v in shares_of
-        )
         nearest = cKDTree((rim + middle).T).query(near_rim.T)[1]
-        own = weights[points] * known[nearest] * _fading((1 - size[points]) / depth)
-        return cls(points, along, together, parabola, plane, columns(*near_rim) * own)
+        own = weights[points] * known[nearest]
+        # The points stand for the covered part of the outline only.
+        area = triangles * known / max(float(np.sum(triangles[known])), 1e-300)
+        area *= np.sum(own) / (1 - (1 - 2 * depth) ** 2)
+        area = np.outer(area, shares).ravel()
+        begins = np.arange(len(area) + 1) * _AROUND
+        sums = columns(*near_rim) * own * _fading((1 - size[points]) / depth)
+        parabola, plane = np.zeros((2, *sums.shape))
+        for made, share in zip((parabola, plane), shares_of, strict=True):
+            each = csr_array((share.ravel(), near.ravel(), begins), (len(area), len(u)))
+            of_means = np.repeat(columns(*at) * area @ each / along, along, axis=1)
+            made[:, np.flatnonzero(np.repeat(together, along))] = of_means
+        return cls(points, parabola - sums, (parabola - plane) / 2)
 
     def missed(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return what sums over ``values`` (s,) of the points miss (k,), and errors (k, 1 + m)."""
-        means = self._means(values)
-        parabola, plane = self.parabola @ means, self.plane @ means
-        noise = np.diff(values, 2).std() / np.sqrt(6 * self.along)
-        # Each mean counts as a value of its own in the integrals, and less in the sums.
-        more = self.parabola - self.along * self._means(self.sums)
-        errors = np.column_stack([(parabola - plane) / 2, noise * more])
-        return parabola - self.sums @ values, errors
-
-    def _means(self, values: FloatArray) -> FloatArray:
-        """Return means of successive ``values`` (…, s): (…, m)."""
-        whole = len(self.together) * self.along
-        groups = values[..., :whole].reshape(*values.shape[:-1], -1, self.along)
-        return np.asarray(np.mean(groups[..., self.together, :], axis=-1))
+        """Return what sums over ``values`` (s,) of the points miss (k,), and errors (k, 1 + s)."""
+        noise = np.diff(values, 2).std() / np.sqrt(6)
+        return self.more @ values, np.column_stack([self.open_ @ values, noise * self.more])
 
 
 def _around(outline: Aperture) -> tuple[FloatArray, FloatArray]:

@@ -85,6 +85,25 @@ def test_a_rolled_edge_beyond_the_last_whole_turn_belongs_to_the_figures(turns):
         assert rms.uncertainty < 0.016 * true
 
 
+@pytest.mark.parametrize("missing", [0.0, 0.25])
+def test_the_rms_is_of_the_covered_part_of_the_rim(missing):
+    """Astigmatism of 100 nm at the rim has a mean square of (100 nm)² / 6 on any such sector.
+
+    What a sector lacks along its rim is no form that the tracks miss.
+    """
+    share = np.linspace(1, 0, 30_000)
+    turn = 2 * np.pi * 60 * share
+    x, y = (R * share * f(turn) for f in (np.cos, np.sin))
+    form = 100e-9 * share**2 * np.cos(2 * turn)
+    there = turn % (2 * np.pi) >= 2 * np.pi * missing
+    outline = Aperture(R)
+    map_ = DeviationMap(x=x[there], y=y[there], deviation=form[there], noise=0.0,
+                        area=area_weights(x[there], y[there], outline=outline),
+                        effects=np.empty((0, int(np.sum(there)))))  # fmt: skip
+    [(_, _, rim)] = extents_of_parts([map_], outline, outline, R / 60)
+    assert rms_of_part(map_, rim).value == pytest.approx(100e-9 / 6**0.5, rel=5e-3)
+
+
 def test_a_rolled_edge_on_a_dense_map_is_no_higher_than_it_is():
     """Terms up to order 12 swing about an edge that falls within an eighth of the radius."""
     line = np.linspace(-R, R, 220)
