@@ -304,19 +304,14 @@ def _tilting(n: float) -> Columns:
 
 
 def _radial(n: float) -> Columns:
-    def columns(v: ScanView) -> FloatArray:
-        return np.stack([v.across(*way) for wave in _waves(v.c, n)
-                         for way in ((wave, 0.0), (0.0, wave))])  # fmt: skip
-
-    return columns
+    return lambda v: np.stack(
+        [v.across(*way) for wave in _waves(v.c, n) for way in ((wave, 0.0), (0.0, wave))]
+    )
 
 
 def _angular(n: float) -> Columns:
-    def columns(v: ScanView) -> FloatArray:
-        # C in error by ε turns the reported place by −ε about the spindle.
-        return v.across(0.0, -v.slide_x) * np.stack(_waves(v.c, n))
-
-    return columns
+    # C in error by ε turns the reported place by −ε about the spindle.
+    return lambda v: v.across(0.0, -v.slide_x) * np.stack(_waves(v.c, n))
 
 
 def _of_the_spindle(priors: Sequence[Source]) -> list[Family]:

@@ -73,8 +73,6 @@ def averaged(at: FloatArray, time: FloatArray, values: FloatArray, ramp: float) 
     """Return the polygon through ``values`` (n,) at ``time`` (n,), averaged over ``ramp`` [s]."""
     from scipy.interpolate import make_interp_spline  # takes 0.3 s to load
 
-    if ramp <= 0:
-        return np.asarray(np.interp(at, time, values))
     reach = ramp + max(float(time[0] - np.min(at)), float(np.max(at) - time[-1]), 0.0)
     longer = np.concatenate([[time[0] - reach], time, [time[-1] + reach]])
     held = np.concatenate([values[:1], values, values[-1:]])
@@ -103,8 +101,7 @@ def planned_at(path: Path, duration: float, segment: float, cycle: float) -> Pla
     """Return ``path`` in segments of ``segment`` [s]."""
     time = np.asarray(np.arange(round(duration / segment) + 1) * segment, np.float64)
     x, z, c = path(time)
-    part = np.arange(_WITHIN * (len(time) - 1), dtype=np.float64) + 0.5
-    within = np.asarray(part * (segment / _WITHIN), np.float64)
+    within = np.asarray((np.arange(_WITHIN * (len(time) - 1)) + 0.5) * (segment / _WITHIN))
     wanted = path(within)[1]
     moved = z.copy()
     for _ in range(_ROUNDS):
