@@ -250,7 +250,7 @@ def _show_scans(facts: Facts) -> None:
         rows.append(
             (
                 one["name"],
-                f"U = {quantity(one['expanded_uncertainty'], 'm', 2)} (rms, k = 2) in "
+                f"U = {quantity(one['expanded_uncertainty'], 'm', 2)} (PV, k = 2) in "
                 f"{one['duration'] / 60:.1f} min: {scans}{verified}",
             )
         )
@@ -264,7 +264,6 @@ def _show_scans(facts: Facts) -> None:
                 for k, path in enumerate(facts["paths"])
             ),
             ("chosen", f"{facts['set']}, which {reached} {quantity(facts['accuracy'], 'm', 2)}"),
-            ("", "U of PV, by which 'omsm adjust' judges, is two to three times as large"),
             written(facts["files"]),
         ]
     )

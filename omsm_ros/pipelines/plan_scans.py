@@ -60,11 +60,8 @@ def exceeded_limits(
     share = min(_JUDGED_TURNS / turns, 1.0)
     time = np.arange(0.0, design.duration * share, 1 / _JUDGED_HZ)
     # The steepest turns are the outer ones.
-    outer = (
-        design
-        if abs(design.start) >= abs(design.end)
-        else replace(design, start=design.end, end=design.start)
-    )
+    ends = sorted((design.start, design.end), key=abs)
+    outer = replace(design, start=ends[1], end=ends[0])
     x, z, c = scan_path(outer, nominal, time)
     path = ScanPath(z=z, sample_period=1 / _JUDGED_HZ, x=x, c=c)
     found, _ = speed_limits(path, limits, _JUDGED_HZ / 2, accuracy)
@@ -77,10 +74,8 @@ def planned_sets(
     stated: MachineSources,
     accuracy: float,
     limits: MachineLimits,
-) -> tuple[tuple[str, PlannedSet], ...]:
+) -> tuple[PlannedSet, ...]:
     """Return the sets of scans that the machine can make, the shortest that reaches first.
-
-    A single scan comes last: nothing verifies it.
 
     first: a scan that the machine can make;  accuracy: asked for, k = 2 [m]
 
@@ -92,14 +87,11 @@ def planned_sets(
         for name, designs in usual_sets(first).items()
         if not any(exceeded_limits(design, nominal, limits, accuracy) for design in designs)
     }
-    planned = plan_scans(list(sets.values()), priors_of(stated), nominal, accuracy)
-    names = {designs: name for name, designs in sets.items()}
-    redundant_first = sorted(planned, key=lambda one: len(one.designs) < 2)
-    return tuple((names[p.designs], p) for p in redundant_first)
+    return plan_scans(sets, priors_of(stated), nominal, accuracy)
 
 
 def plan_facts(
-    sets: Sequence[tuple[str, PlannedSet]],
+    sets: Sequence[PlannedSet],
     accuracy: float,
     out: Path,
     nominal: Surface,
@@ -113,22 +105,22 @@ def plan_facts(
 
     bound: on the distance of the executed path from the surface [m];  cycle: of the servo [s]
     """
-    name, best = sets[0]
+    best = sets[0]
     paths = write_scans(best.designs, nominal, out, bound, cycle, dialect)
     return {
         "path_error": bound,
-        "set": name,
+        "set": best.name,
         "reaches": best.reaches,
         "accuracy": accuracy,
         "sets": [
             {
-                "name": one,
-                "expanded_uncertainty": 2 * planned.uncertainty.form,
+                "name": planned.name,
+                "expanded_uncertainty": 2 * planned.uncertainty.pv,
                 "duration": planned.uncertainty.duration,
                 "reaches": planned.reaches,
                 "scans": [asdict(design) for design in planned.designs],
             }
-            for one, planned in sets
+            for planned in sets
         ],
         "paths": [
             path_entry(path, design, nominal)

@@ -58,9 +58,8 @@ def next_steps(verdict: Mapping[str, Any]) -> list[str]:
     if (add := verdict.get("add")) is not None and verdict["code"] != "contradicted":
         then = ""
         if add["reached"] is not None:
-            rms = quantity(add["reached"], "m", 2)
-            then = f": then U = {rms} (rms, k = 2), of PV two to three times that"
-        steps.insert(doubts, f"next: {add['text']}, and run 'omsm adjust' with both scans{then}")
+            then = f": then U of PV is about {quantity(add['reached'], 'm', 2)} (k = 2)"
+        steps.insert(doubts, f"next: {add['text']}, and run 'omsm adjust' with all scans{then}")
     if verdict["code"] == "verified":
         steps.append("the scans agree, and no declared source is refuted")
         if (resting := verdict.get("rests_on")) is not None:

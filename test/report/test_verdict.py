@@ -25,7 +25,7 @@ def test_the_level_is_that_of_the_verdict(summary, code):
 def test_what_to_do_next_stands_first(summary):
     first, *others = verdict_on_measurement(summary).reasons
     assert first.replace("\u202f", " ").startswith(
-        "next: scan again faster, and run 'omsm adjust' with both scans: then U = 4.0 nm"
+        "next: scan again faster, and run 'omsm adjust' with all scans: then U of PV is about 4.0"
     )
     assert others == ["one speed cannot show a lag"]
 

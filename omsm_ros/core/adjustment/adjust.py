@@ -49,6 +49,7 @@ from omsm_ros.core.adjustment.scan_data import (
 )
 from omsm_ros.core.adjustment.sources import Family, Source, base_name, prior_sizes, with_dynamics
 from omsm_ros.core.adjustment.verdict import (
+    NO_ADDITION,
     WRONG_SENSE,
     Reason,
     Verdict,
@@ -206,13 +207,16 @@ def adjust(
     enough, stated = redundant(scans), {p.name for p in priors}
     walk, least = _walk(detecting, priors), MODEL_SHARE * form.rms.value
     reasons = reasons_of(refutations, stated, agreement, wrong, walk, accepted, least)
+    expanded, addition = 2 * form.pv.uncertainty, NO_ADDITION
+    if not enough or (accuracy is not None and not reasons and expanded > accuracy):
+        best = best_addition(scans, priors, surface, removed)
+        addition = best if not enough or best[1] < expanded else addition
     verdict = verdict_of(
         _or_sense_of_c(reasons, scans, priors, surface, refutations),
         not_evaluated(families, effects, priors, accuracy)
         + looks_like(form.resembled, families, accepted, open_limit(accuracy)),
         rests_on(families, effects, form.mean_uncertainty, _mirrored(scans, surface, form)),
-        enough, 2 * form.pv.uncertainty, accuracy,
-        None if enough else best_addition(scans[0], priors, surface, removed),
+        enough, expanded, accuracy, addition,
         calibration,
         largest_contribution(made, effects, doubts, form.alike, accuracy),
     )  # fmt: skip

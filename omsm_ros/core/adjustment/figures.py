@@ -181,7 +181,7 @@ def effects_on_form(made: FormOf) -> dict[str, Effect]:
         share, axes = np.linalg.eigh(covariance)
         left = _rms(made.places, change @ (axes * np.sqrt(np.maximum(share, 0.0))))
         open_changes = change @ evidence_of(solution, family).free
-        free, peak = _rms(made.places, open_changes), float(np.linalg.norm(_pv(open_changes)))
+        free, peak = _rms(made.places, open_changes), float(np.linalg.norm(pv_of(open_changes)))
         root = evidence_of(any_part, family).free
         # Without the plausible size itself: (root rootᵀ)⁻¹ = information + wide⁻².
         known = family.wide**2 * np.linalg.pinv(root @ root.T, rcond=1e-10) - np.eye(family.size)
@@ -216,7 +216,8 @@ def largest_contribution(
 
     def excess(factor: float, share: FloatArray) -> float:
         """Return U less ``accuracy`` where ``factor`` of a source is left [m]."""
-        return 2 * _figure(made.height, errors + (factor - 1) * share, _pv).uncertainty - accuracy
+        left = errors + (factor - 1) * share
+        return 2 * figure_of(made.height, left, pv_of).uncertainty - accuracy
 
     if excess(1.0, np.zeros_like(errors)) <= 0:
         return None
@@ -299,8 +300,8 @@ class FormOf:
         draws = self.free(self.errors()[0])
         if open_changes is not None:
             draws = self.with_changes(draws, open_changes)
-        rms = _figure(self.height, draws, lambda h: np.sqrt(self.places.area @ h**2))
-        return _figure(self.height, draws, _pv), rms
+        rms = figure_of(self.height, draws, lambda h: np.sqrt(self.places.area @ h**2))
+        return figure_of(self.height, draws, pv_of), rms
 
     def open_changes(
         self, doubts: Sequence[Doubt], alike: Sequence[tuple[str, FloatArray]] = ()
@@ -340,7 +341,8 @@ def _chances(number: int) -> FloatArray:
     return np.random.default_rng([0, 1]).standard_normal((number, _DRAWS))
 
 
-def _pv(heights: FloatArray) -> FloatArray:
+def pv_of(heights: FloatArray) -> FloatArray:
+    """Return the peak to valley of ``heights`` (n, …) [m]."""
     return np.asarray(np.ptp(heights, axis=0))
 
 
@@ -429,7 +431,7 @@ def _pose(
     return made, np.asarray(fit)
 
 
-def _figure(
+def figure_of(
     height: FloatArray, draws: FloatArray, of: Callable[[FloatArray], FloatArray]
 ) -> Figure:
     """Return a figure of ``height``, its uncertainty by draws: their spread and their bias."""

@@ -143,7 +143,7 @@ def part_model(blocks: Blocks, turns: float, highest: int = HIGHEST_DEGREE) -> P
 
 
 # Amplitudes of turned and of polished parts fall with about the 1.5th power of the degree.
-_START_POWER = 3.0
+START_POWER = 3.0
 # Sizes that are compared, over the plausible one; each is as probable.
 _SIZES = 10.0 ** np.arange(-1.5, 1.1, 0.5)
 # Relative to a log likelihood of some hundreds, which matters from 0.5 on.
@@ -196,7 +196,7 @@ class FormTerms:
         share, axes = np.linalg.eigh(self.covariance + columns @ columns.T)
         # A small scan leaves terms of which only the rounding is known, of either sign.
         known = axes * np.maximum(share, _ROUNDING * share[-1]) @ axes.T
-        start = np.log(np.mean(self.values**2 * self.degrees**_START_POWER) + 1e-30)
+        start = np.log(np.mean(self.values**2 * self.degrees**START_POWER) + 1e-30)
 
         def own(law: FloatArray) -> FloatArray:
             amplitude = np.exp(np.where(self.symmetric, law[1], law[0]))
@@ -215,7 +215,7 @@ class FormTerms:
             return float(value), np.array(slope)
 
         # The law of terms that are zero has no end: 50 is twenty orders of magnitude.
-        bounds = [(start - 50, start + 50)] * 2 + [(0.0, 4 * _START_POWER)]
-        best = scipy.optimize.minimize(misfit, [start, start, _START_POWER], method="L-BFGS-B",
+        bounds = [(start - 50, start + 50)] * 2 + [(0.0, 4 * START_POWER)]
+        best = scipy.optimize.minimize(misfit, [start, start, START_POWER], method="L-BFGS-B",
                                  jac=True, bounds=bounds, options=_TOLERANCE)  # fmt: skip
         return -float(best.fun), known + np.diag(own(best.x))

@@ -6,6 +6,7 @@ equations are those of the adjustment (:mod:`network`), without heights.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,11 +20,11 @@ from omsm_ros.core.adjustment.families import (
     families_of,
     ranges_of,
 )
-from omsm_ros.core.adjustment.figures import POSE, FormOf, form_map
+from omsm_ros.core.adjustment.figures import POSE, FormOf, figure_of, pv_of
 from omsm_ros.core.adjustment.network import Network, Scales, solve
-from omsm_ros.core.adjustment.part_terms import part_model
+from omsm_ros.core.adjustment.part_terms import START_POWER, part_model
 from omsm_ros.core.adjustment.refutation import completed
-from omsm_ros.core.adjustment.scan_data import LEAST_POINTS, ScanData, view_of, zero_of
+from omsm_ros.core.adjustment.scan_data import ARRAYS, LEAST_POINTS, ScanData, view_of, zero_of
 from omsm_ros.core.adjustment.sources import Source, prior_sizes
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
@@ -36,6 +37,9 @@ _POINTS_A_TURN, _MOST_TURNS = 96, 24
 _DEGREE = 12
 # Of a reading, a drift after a second, and a cell: where nothing is declared.
 _NOISE_M, _WALK_M, _CELLS_M, _BAND_M = 12e-9, 1e-9, 1e-9, 5e-9
+# Forms that are drawn for a plan, their rms, and the share of them that shall reach it: where a
+# form has its peaks decides how certain its PV is, and how large they are hardly does.
+_FORMS, _FORM_M, _SHARE = 40, 30e-9, 0.9
 # Between two scans: the spindle is stopped, turned over, and the probe driven back.
 _PAUSE_S = 20.0
 # A third turn of the part would leave its third harmonics where they were.
@@ -77,20 +81,20 @@ class ScanDesign:
 class PlannedUncertainty:
     """Uncertainty that an adjustment of a set of scans will reach.
 
-    form: standard uncertainty of the heights once the pose is removed, rms over the part [m]
+    pv: standard uncertainty of PV once the pose is removed, which nine of ten parts reach [m]
     sources: of each family that takes part, standard uncertainty after the scans [unit]
     duration: of all scans and the pauses between them [s]
     """
 
-    form: float
+    pv: float
     sources: Mapping[str, FloatArray]
     duration: float
 
 
-@dataclass(frozen=True, eq=False)
-class PlannedSet:
+class PlannedSet(NamedTuple):
     """A set of scans with what it reaches;  reaches: True if that is the wanted accuracy."""
 
+    name: str
     designs: tuple[ScanDesign, ...]
     uncertainty: PlannedUncertainty
     reaches: bool
@@ -128,34 +132,46 @@ def posterior_uncertainty(
         cells=_CELLS_M**2,
         noise=np.ones(len(scans)),
     )
-    network = Network(blocks, families, part)
-    solution = solve(network, np.zeros(len(blocks)), scales, sizes)
+    solution = solve(Network(blocks, families, part), np.zeros(len(blocks)), scales, sizes)
     return PlannedUncertainty(
-        form=form_map(FormOf.of(completed(solution), nominal, removed)).mean_uncertainty,
+        pv=_of_pv(FormOf.of(completed(solution), nominal, removed)),
         sources={f.name: solution.uncertainty(f.name) for f in families if f.name in sizes},
         duration=begin - _PAUSE_S,
     )
 
 
+def _of_pv(made: FormOf) -> float:
+    """Return the standard uncertainty of PV that ``_SHARE`` of the drawn forms reach [m]."""
+    part, places = made.solution.network.part, made.places
+    sizes = np.array([t.n ** (-START_POWER / 2) if t.n > 1 else 0.0 for t in part.terms])
+    terms = part.values(places.x, places.y)[:, : len(sizes)] * sizes
+    drawn = made.free(terms @ np.random.default_rng(0).standard_normal((len(sizes), _FORMS)))
+    forms = (drawn * (_FORM_M / np.sqrt(places.area @ drawn**2))).T
+    errors = made.free(made.errors()[0])
+    found = [figure_of(form, errors, pv_of).uncertainty for form in forms]
+    return float(np.quantile(found, _SHARE))
+
+
 def plan_scans(
-    candidates: Sequence[Sequence[ScanDesign]],
+    candidates: Mapping[str, tuple[ScanDesign, ...]],
     priors: Sequence[Source],
     nominal: Surface,
     accuracy: float,
 ) -> tuple[PlannedSet, ...]:
     """Return the sets of scans, the shortest that reaches ``accuracy`` [m] (k = 2) first.
 
-    Those that do not reach it follow, the most accurate first.
+    Those that do not reach it follow, the most accurate first, and single scans come last: nothing
+    verifies them.
     """
+
+    def order(one: PlannedSet) -> tuple[bool, bool, float]:
+        reached = one.uncertainty.duration if one.reaches else one.uncertainty.pv
+        return len(one.designs) < 2, not one.reaches, reached
+
     found = []
-    for designs in candidates:
+    for name, designs in candidates.items():
         planned = posterior_uncertainty(designs, priors, nominal)
-        found.append(PlannedSet(tuple(designs), planned, 2 * planned.form <= accuracy))
-
-    def order(planned: PlannedSet) -> tuple[bool, float]:
-        one = planned.uncertainty
-        return (not planned.reaches, one.duration if planned.reaches else one.form)
-
+        found.append(PlannedSet(name, designs, planned, 2 * planned.pv <= accuracy))
     return tuple(sorted(found, key=order))
 
 
@@ -167,13 +183,13 @@ def usual_sets(first: ScanDesign) -> dict[str, tuple[ScanDesign, ...]]:
     other = additions(first)
     quick = (first, other[OTHER_SPEED])
     again = other[RECLOCKED]
-    third = replace(again, clocking=2.5 * _RECLOCKED_RAD + first.clocking)
     return {
         "single": (first,),
         "quick": quick,
         "quick_beyond": (first, other[BEYOND_CENTRE]),
         "full": (*quick, again),
-        "full_4": (*quick, again, third),
+        "full_beyond": (first, other[BEYOND_CENTRE], again),
+        "full_4": (*quick, again, replace(again, clocking=first.clocking + 2.5 * _RECLOCKED_RAD)),
     }
 
 
@@ -201,11 +217,7 @@ def additions(first: ScanDesign) -> dict[str, ScanDesign]:
 
 def design_of(scan: ScanData) -> ScanDesign:
     """Return the design that ``scan`` followed, as far as it is a spiral."""
-    radius = np.hypot(scan.x, scan.y)
-    edge = max(len(scan) // 200, 1)
-    start, end = float(np.max(radius[:edge])), float(np.min(radius[-edge:]))
-    if scan.outward:
-        start, end = float(np.min(radius[:edge])), float(np.max(radius[-edge:]))
+    start, *_, end = ((scan.x + 1j * scan.y) * np.exp(1j * scan.c)).real.tolist()
     return ScanDesign(
         rpm=scan.speed * 30 / np.pi,
         start=start,
@@ -237,9 +249,8 @@ def design_scan(design: ScanDesign, nominal: Surface, begin: float, shown: float
     # The probe is driven through some of its range on the way, else its scale would not show.
     distance = _RANGE_M * np.sin(2 * np.pi * 7 * share)
     channels = (begin + time, chuck.real, chuck.imag, motion, distance, motion, np.zeros(number), c)
-    names = ("time", "x", "y", "height", "distance", "motion", "removed", "c")
     return ScanData(
-        **{name: values[seen] for name, values in zip(names, channels, strict=True)},
+        **{name: values[seen] for name, values in zip(ARRAYS, channels, strict=True)},
         clocking=design.clocking,
         clamping=design.clamping,
         weight=max(design.duration * design.rate / number, 1e-9),
@@ -247,13 +258,16 @@ def design_scan(design: ScanDesign, nominal: Surface, begin: float, shown: float
 
 
 def best_addition(
-    scan: ScanData, priors: Sequence[Source], nominal: Surface, removed: Sequence[str] = POSE
+    scans: Sequence[ScanData],
+    priors: Sequence[Source],
+    nominal: Surface,
+    removed: Sequence[str] = POSE,
 ) -> tuple[str, float]:
-    """Return the code of the scan to add to ``scan`` that helps most, and what form then is [m]."""
-    first = design_of(scan)
+    """Return the code of the scan to add that helps most, and U (k = 2) of PV with it [m]."""
+    designs = [design_of(scan) for scan in scans]
     reached = {
-        code: posterior_uncertainty([first, added], priors, nominal, removed).form
-        for code, added in additions(first).items()
+        code: 2 * posterior_uncertainty([*designs, added], priors, nominal, removed).pv
+        for code, added in additions(designs[0]).items()
         if code != REPEATED_TRACK  # leaves the set without redundancy
     }
     return min(reached.items(), key=lambda item: item[1])

@@ -5,6 +5,7 @@ Codes and values only; sentences are made elsewhere.
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -26,6 +27,7 @@ UNDECLARED_EFFECT, NOT_REDUNDANT, UNCERTAINTY = "undeclared_effect", "not_redund
 NOT_EVALUATED, DECLARED_ONLY = "not_evaluated", "declared_only"
 UNIDENTIFIED, LOOKS_LIKE = "unidentified", "looks_like"
 
+NO_ADDITION = "", float("nan")
 # Standard deviations; drift beyond them is not the declared drift (probability 1e-4, one-sided).
 _RARE_WALK = 3.7
 # Speeds nearer to each other than a tenth leave a lag as open as one scan does.
@@ -55,7 +57,7 @@ class Verdict:
     rests_on: declared sources that these scans do not verify, name and standard uncertainty of
         the heights by each [m], largest first;  would_show: code of what shows most of them
     add: code of the one scan to add that helps most, "" where none is needed
-    reached: expanded uncertainty (k = 2) of the heights with that scan, rms over the part [m]
+    reached: expanded uncertainty (k = 2) of PV with that scan [m]
     """
 
     code: str
@@ -68,14 +70,11 @@ class Verdict:
 
 def redundant(scans: Sequence[ScanData]) -> bool:
     """Return whether two of the scans differ in speed or direction, and in time."""
-    speeds = [s.speed for s in scans]
-    for k, one in enumerate(scans):
-        for other, speed in zip(scans[k + 1 :], speeds[k + 1 :], strict=True):
-            apart = one.time[-1] < other.time[0] or other.time[-1] < one.time[0]
-            differ = abs(speed - one.speed) > _OTHER_SPEED * max(abs(speed), abs(one.speed))
-            if apart and differ:
-                return True
-    return False
+    return any(
+        (one.time[-1] < other.time[0] or other.time[-1] < one.time[0])
+        and abs(other.speed - one.speed) > _OTHER_SPEED * max(abs(other.speed), abs(one.speed))
+        for one, other in combinations(scans, 2)
+    )
 
 
 def reasons_of(
@@ -233,7 +232,7 @@ def verdict_of(
     is_redundant: bool,
     expanded: float,
     accuracy: float | None,
-    addition: tuple[str, float] | None,
+    addition: tuple[str, float],
     calibration: Calibration | None = None,
     largest: Contribution | None = None,
 ) -> Verdict:
@@ -241,11 +240,10 @@ def verdict_of(
 
     open_sources: what is neither shown nor declared;  resting: of :func:`rests_on`
     expanded: uncertainty (k = 2) of PV [m];  accuracy: asked for [m], None: none
-    addition: code of the scan to add and the standard uncertainty that is reached [m]
+    addition: code of the scan to add, and the expanded uncertainty of PV that is reached [m]
     calibration: that corrected the heights; where it was rejected they are not valid
     largest: contribution to ``expanded`` where it is too large
     """
-    add, reached = ("", float("nan")) if addition is None else (addition[0], 2 * addition[1])
     reasons = [*contradictions, *open_sources]
     rejected = calibration is not None and calibration.certificate.verdict == REJECTED
     if rejected:
@@ -266,4 +264,4 @@ def verdict_of(
         code = NOT_VERIFIED
     else:
         code = VERIFIED
-    return Verdict(code, tuple(reasons), resting[0], add, reached, resting[1])
+    return Verdict(code, tuple(reasons), resting[0], *addition, resting[1])
