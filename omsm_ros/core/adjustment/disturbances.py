@@ -12,7 +12,7 @@ import numpy as np
 from omsm_ros.core.adjustment.families import REPEATED_TRACK, only
 from omsm_ros.core.adjustment.network import Solution
 from omsm_ros.core.adjustment.scan_data import ScanView
-from omsm_ros.core.adjustment.sources import VIBRATION, Family
+from omsm_ros.core.adjustment.sources import VIBRATION, Columns, Family
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.streams.statistics import spread_about_median
 
@@ -33,17 +33,8 @@ _FOLLOWS, _NEAR_WHOLE = 0.95, 0.1
 _HEIGHT_STEP_M, _C_LOST_RAD = 1e-7, 1e-3
 
 
-@dataclass(frozen=True)
-class Line:
-    """A wave in time: frequency [Hz] and amplitude [m] in scan ``scan``."""
-
-    scan: int
-    frequency: float
-    amplitude: float
-
-
-def lines_of(solution: Solution, view: ScanView) -> list[Line]:
-    """Return waves in time that stand out of the noise of one scan."""
+def lines_of(solution: Solution, view: ScanView) -> list[Family]:
+    """Return waves in time that stand out of the noise of one scan, both phases of each."""
     net = solution.network
     mine = net.blocks.scan == view.index
     fitted = (
@@ -59,7 +50,7 @@ def lines_of(solution: Solution, view: ScanView) -> list[Line]:
     nearest = np.round(multiple)
     part = (np.abs(multiple - nearest) < _SIDE_BAND) & (nearest <= _PART_HARMONICS)
     part |= multiple < 0.9
-    found: list[Line] = []
+    found: list[Family] = []
     while len(found) < _MOST_LINES:
         power = np.abs(np.fft.rfft(series * np.hanning(len(series)))) ** 2
         ratio = np.where(part, 0.0, power / np.maximum(_floor(power), 1e-300))
@@ -73,8 +64,10 @@ def lines_of(solution: Solution, view: ScanView) -> list[Line]:
         refined = float(frequency[peak] + shift * frequency[1])
         if not _lasting(series, 2 * np.pi * refined * period):
             break
-        wave, series = _without(series, 2 * np.pi * refined * period)
-        found.append(Line(view.index, refined, wave))
+        _, series = _without(series, 2 * np.pi * refined * period)
+        name = f"{VIBRATION}/{refined:.4g}@{view.index}"
+        wave = only(view.index, 2, _wave(2 * np.pi * refined))
+        found.append(Family(name, "m", 2, wave, 1e-7, REPEATED_TRACK))
     return found
 
 
@@ -115,19 +108,12 @@ def _floor(power: FloatArray) -> FloatArray:
     return np.asarray(np.interp(np.arange(len(power)), middle, level) / np.log(2.0))
 
 
-def line_family(line: Line) -> Family:
-    """Return both phases of a line in time."""
-    turned = 2 * np.pi * line.frequency
-
-    def columns(v: ScanView) -> FloatArray:
-        return np.stack([np.cos(turned * v.since), np.sin(turned * v.since)])
-
-    name = f"{VIBRATION}/{line.frequency:.4g}@{line.scan}"
-    return Family(name, "m", 2, only(line.scan, 2, columns), 1e-7, REPEATED_TRACK)
+def _wave(turned: float) -> Columns:
+    return lambda v: np.stack([np.cos(turned * v.since), np.sin(turned * v.since)])
 
 
 @dataclass(frozen=True)
-class Step:
+class _Step:
     """A change from one turn to the next at ``time`` in scan ``scan`` [s].
 
     kind: "height_step" of the height, or "c_lost" of the angle;  deviate: in standard deviations
@@ -139,7 +125,7 @@ class Step:
     deviate: float
 
 
-def steps_of(solution: Solution, scan: int) -> list[Step]:
+def steps_of(solution: Solution, scan: int) -> list[Family]:
     """Return the largest step of the height and of the angle, where they stand out.
 
     The angle is compared from turn to turn, so a scan within one turn shows no step of it.
@@ -147,10 +133,10 @@ def steps_of(solution: Solution, scan: int) -> list[Step]:
     found = [_height_step(solution, scan)]
     if np.any(solution.network.blocks.turn[solution.network.blocks.scan == scan]):
         found.append(_angle_step(solution, scan))
-    return [step for step in found if step.deviate > _STEP_LIMIT]
+    return [_family_of(step) for step in found if step.deviate > _STEP_LIMIT]
 
 
-def _height_step(solution: Solution, scan: int) -> Step:
+def _height_step(solution: Solution, scan: int) -> _Step:
     net = solution.network
     here, width = net.knots[scan], net.steps[scan]
     moves = np.diff(solution.values[here])
@@ -160,7 +146,7 @@ def _height_step(solution: Solution, scan: int) -> Step:
     since = net.blocks.since[mine]
     left = (solution.residual() + net.of_drift(solution.values))[mine]
     window = (since > (knot - 1) * width) & (since < (knot + 2) * width)
-    return Step(scan, "height_step", _break(since[window], left[window]), float(size[knot]))
+    return _Step(scan, "height_step", _break(since[window], left[window]), float(size[knot]))
 
 
 def _break(time: FloatArray, values: FloatArray) -> float:
@@ -173,7 +159,7 @@ def _break(time: FloatArray, values: FloatArray) -> float:
     return float((time[best] + time[best + 1]) / 2)
 
 
-def _angle_step(solution: Solution, scan: int) -> Step:
+def _angle_step(solution: Solution, scan: int) -> _Step:
     net = solution.network
     mine = net.blocks.scan == scan
     turn, left = net.blocks.turn[mine], solution.residual()[mine]
@@ -199,10 +185,10 @@ def _angle_step(solution: Solution, scan: int) -> Step:
     window = (since >= begin) & (since <= end)
     # From there on the column is found in what is left with another coefficient.
     time = _break(since[window], left[window] * np.sign(centred[window]))
-    return Step(scan, "c_lost", time, float(size[best]))
+    return _Step(scan, "c_lost", time, float(size[best]))
 
 
-def step_family(step: Step) -> Family:
+def _family_of(step: _Step) -> Family:
     """Return what a step of height or angle does from its time on."""
 
     def columns(v: ScanView) -> FloatArray:

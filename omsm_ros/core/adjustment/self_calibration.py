@@ -399,7 +399,7 @@ def _amplitudes(solution: Solution, nominal: Surface, harmonics: int) -> FloatAr
     radius = np.linspace(net.part.inner, net.part.outer, _RADII)
     turn = np.exp(2j * np.pi * np.arange(_ANGLES) / _ANGLES)
     x, y = (np.outer(radius, part).ravel() for part in (turn.real, turn.imag))
-    height = nominal.height(x, y) + net.part.values(x, y) @ solution.values[net.terms]
+    height = nominal.height(x, y) + solution.smooth_form(x, y)
     waves = np.abs(np.fft.rfft(height.reshape(_RADII, _ANGLES), axis=1)) * 2 / _ANGLES
     return np.asarray(np.sqrt(np.mean(waves[:, 1 : harmonics + 1] ** 2, axis=0)))
 
