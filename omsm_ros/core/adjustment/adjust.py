@@ -2,18 +2,13 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from omsm_ros.core.adjustment.agreement import ScanAgreement, agreement_of
 from omsm_ros.core.adjustment.blocks import block_columns, blocks_of
-from omsm_ros.core.adjustment.disturbances import (
-    follows_removed,
-    line_family,
-    lines_of,
-    step_family,
-    steps_of,
-)
+from omsm_ros.core.adjustment.disturbances import follows_removed, lines_of, steps_of
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.families import families_of, ranges_of
 from omsm_ros.core.adjustment.figures import (
@@ -49,7 +44,6 @@ from omsm_ros.core.adjustment.scan_data import (
 )
 from omsm_ros.core.adjustment.sources import Family, Source, base_name, prior_sizes, with_dynamics
 from omsm_ros.core.adjustment.verdict import (
-    NO_ADDITION,
     WRONG_SENSE,
     Reason,
     Verdict,
@@ -207,16 +201,13 @@ def adjust(
     enough, stated = redundant(scans), {p.name for p in priors}
     walk, least = _walk(detecting, priors), MODEL_SHARE * form.rms.value
     reasons = reasons_of(refutations, stated, agreement, wrong, walk, accepted, least)
-    expanded, addition = 2 * form.pv.uncertainty, NO_ADDITION
-    if not enough or (accuracy is not None and not reasons and expanded > accuracy):
-        best = best_addition(scans, priors, surface, removed)
-        addition = best if not enough or best[1] < expanded else addition
     verdict = verdict_of(
         _or_sense_of_c(reasons, scans, priors, surface, refutations),
         not_evaluated(families, effects, priors, accuracy)
         + looks_like(form.resembled, families, accepted, open_limit(accuracy)),
         rests_on(families, effects, form.mean_uncertainty, _mirrored(scans, surface, form)),
-        enough, expanded, accuracy, addition,
+        enough, 2 * form.pv.uncertainty, accuracy,
+        partial(best_addition, scans, priors, surface, removed, solution.smooth_form),
         calibration,
         largest_contribution(made, effects, doubts, form.alike, accuracy),
     )  # fmt: skip
@@ -294,8 +285,8 @@ def _fitted(
     first = settled(solve(network, y, start_scales(network, walk), sizes), _FIRST_STEPS)
     extra: list[Family] = []
     for view in views:
-        extra += map(line_family, lines_of(first, view))
-        extra += map(step_family, steps_of(first, view.index))
+        extra += lines_of(first, view)
+        extra += steps_of(first, view.index)
     if extra:
         network = network.with_families(extra, block_columns(views, extra))
     return fit_and_refute(network, y, first.scales, {**sizes, **prior_sizes(extra, priors)})

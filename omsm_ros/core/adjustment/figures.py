@@ -216,8 +216,7 @@ def largest_contribution(
 
     def excess(factor: float, share: FloatArray) -> float:
         """Return U less ``accuracy`` where ``factor`` of a source is left [m]."""
-        left = errors + (factor - 1) * share
-        return 2 * figure_of(made.height, left, pv_of).uncertainty - accuracy
+        return 2 * figure(made.height, errors + (factor - 1) * share, pv_of).uncertainty - accuracy
 
     if excess(1.0, np.zeros_like(errors)) <= 0:
         return None
@@ -300,8 +299,8 @@ class FormOf:
         draws = self.free(self.errors()[0])
         if open_changes is not None:
             draws = self.with_changes(draws, open_changes)
-        rms = figure_of(self.height, draws, lambda h: np.sqrt(self.places.area @ h**2))
-        return figure_of(self.height, draws, pv_of), rms
+        rms = figure(self.height, draws, lambda h: np.sqrt(self.places.area @ h**2))
+        return figure(self.height, draws, pv_of), rms
 
     def open_changes(
         self, doubts: Sequence[Doubt], alike: Sequence[tuple[str, FloatArray]] = ()
@@ -431,9 +430,7 @@ def _pose(
     return made, np.asarray(fit)
 
 
-def figure_of(
-    height: FloatArray, draws: FloatArray, of: Callable[[FloatArray], FloatArray]
-) -> Figure:
+def figure(height: FloatArray, draws: FloatArray, of: Callable[[FloatArray], FloatArray]) -> Figure:
     """Return a figure of ``height``, its uncertainty by draws: their spread and their bias."""
     value = float(of(height[:, np.newaxis])[0])
     many = of(height[:, np.newaxis] + draws)

@@ -364,6 +364,10 @@ class Solution:
         """Return y less families, part terms and drift, cells still in it, (b,) [m]."""
         return np.asarray(self.y - self.network.fitted(self.values))
 
+    def smooth_form(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the form by its terms at x, y [m], cells left out, (n,) [m]."""
+        return np.asarray(self.network.part.values(x, y) @ self.values[self.network.terms])
+
     def covariance_of(self, here: slice) -> FloatArray:
         """Return the covariance of consecutive parameters that take part."""
         first = int(np.searchsorted(self.active, here.start))

@@ -4,7 +4,7 @@ A design becomes a scan with few points a turn, each of which stands for many re
 equations are those of the adjustment (:mod:`network`), without heights.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from omsm_ros.core.adjustment.families import (
     families_of,
     ranges_of,
 )
-from omsm_ros.core.adjustment.figures import POSE, FormOf, figure_of, pv_of
+from omsm_ros.core.adjustment.figures import POSE, FormOf, figure, pv_of
 from omsm_ros.core.adjustment.network import Network, Scales, solve
 from omsm_ros.core.adjustment.part_terms import START_POWER, part_model
 from omsm_ros.core.adjustment.refutation import completed
@@ -47,6 +47,9 @@ _RECLOCKED_RAD = np.deg2rad(80.0)
 # Share of the radius that a scan goes on beyond the axis.
 _BEYOND = 0.3
 _RANGE_M = 1e-5
+
+Form = Callable[[FloatArray, FloatArray], FloatArray]
+"""Form error [m] at x, y [m], each (n,)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +84,7 @@ class ScanDesign:
 class PlannedUncertainty:
     """Uncertainty that an adjustment of a set of scans will reach.
 
-    pv: standard uncertainty of PV once the pose is removed, which nine of ten parts reach [m]
+    pv: standard uncertainty of PV, its pose removed, of the form or that nine of ten reach [m]
     sources: of each family that takes part, standard uncertainty after the scans [unit]
     duration: of all scans and the pauses between them [s]
     """
@@ -105,10 +108,12 @@ def posterior_uncertainty(
     priors: Sequence[Source],
     nominal: Surface,
     removed: Sequence[str] = POSE,
+    form: Form | None = None,
 ) -> PlannedUncertainty:
     """Return what ``designs``, adjusted together, will leave uncertain.
 
     priors: declared sources, ``noise`` [m] and ``drift_walk`` [m/√s] among them
+    form: form error of the part [m]; None: not known
     """
     scans, begin = [], 0.0
     shorter = max(1.0, max(d.turns for d in designs) / _MOST_TURNS)
@@ -134,22 +139,23 @@ def posterior_uncertainty(
     )
     solution = solve(Network(blocks, families, part), np.zeros(len(blocks)), scales, sizes)
     return PlannedUncertainty(
-        pv=_of_pv(FormOf.of(completed(solution), nominal, removed)),
+        pv=_of_pv(FormOf.of(completed(solution), nominal, removed), form),
         sources={f.name: solution.uncertainty(f.name) for f in families if f.name in sizes},
         duration=begin - _PAUSE_S,
     )
 
 
-def _of_pv(made: FormOf) -> float:
-    """Return the standard uncertainty of PV that ``_SHARE`` of the drawn forms reach [m]."""
+def _of_pv(made: FormOf, form: Form | None) -> float:
+    """Return the standard uncertainty of PV of ``form``, or what ``_SHARE`` of all reach [m]."""
     part, places = made.solution.network.part, made.places
     sizes = np.array([t.n ** (-START_POWER / 2) if t.n > 1 else 0.0 for t in part.terms])
     terms = part.values(places.x, places.y)[:, : len(sizes)] * sizes
-    drawn = made.free(terms @ np.random.default_rng(0).standard_normal((len(sizes), _FORMS)))
-    forms = (drawn * (_FORM_M / np.sqrt(places.area @ drawn**2))).T
+    forms = made.free(terms @ np.random.default_rng(0).standard_normal((len(sizes), _FORMS)))
+    forms *= _FORM_M / np.sqrt(places.area @ forms**2)
+    if form is not None:
+        forms = made.free(form(places.x, places.y)[:, np.newaxis])
     errors = made.free(made.errors()[0])
-    found = [figure_of(form, errors, pv_of).uncertainty for form in forms]
-    return float(np.quantile(found, _SHARE))
+    return float(np.quantile([figure(f, errors, pv_of).uncertainty for f in forms.T], _SHARE))
 
 
 def plan_scans(
@@ -261,12 +267,13 @@ def best_addition(
     scans: Sequence[ScanData],
     priors: Sequence[Source],
     nominal: Surface,
-    removed: Sequence[str] = POSE,
+    removed: Sequence[str],
+    form: Form,
 ) -> tuple[str, float]:
     """Return the code of the scan to add that helps most, and U (k = 2) of PV with it [m]."""
     designs = [design_of(scan) for scan in scans]
     reached = {
-        code: 2 * posterior_uncertainty([*designs, added], priors, nominal, removed).pv
+        code: 2 * posterior_uncertainty([*designs, added], priors, nominal, removed, form).pv
         for code, added in additions(designs[0]).items()
         if code != REPEATED_TRACK  # leaves the set without redundancy
     }

@@ -3,7 +3,7 @@
 Codes and values only; sentences are made elsewhere.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -27,7 +27,6 @@ UNDECLARED_EFFECT, NOT_REDUNDANT, UNCERTAINTY = "undeclared_effect", "not_redund
 NOT_EVALUATED, DECLARED_ONLY = "not_evaluated", "declared_only"
 UNIDENTIFIED, LOOKS_LIKE = "unidentified", "looks_like"
 
-NO_ADDITION = "", float("nan")
 # Standard deviations; drift beyond them is not the declared drift (probability 1e-4, one-sided).
 _RARE_WALK = 3.7
 # Speeds nearer to each other than a tenth leave a lag as open as one scan does.
@@ -232,7 +231,7 @@ def verdict_of(
     is_redundant: bool,
     expanded: float,
     accuracy: float | None,
-    addition: tuple[str, float],
+    best_addition: Callable[[], tuple[str, float]],
     calibration: Calibration | None = None,
     largest: Contribution | None = None,
 ) -> Verdict:
@@ -240,7 +239,7 @@ def verdict_of(
 
     open_sources: what is neither shown nor declared;  resting: of :func:`rests_on`
     expanded: uncertainty (k = 2) of PV [m];  accuracy: asked for [m], None: none
-    addition: code of the scan to add, and the expanded uncertainty of PV that is reached [m]
+    best_addition: returns the code of a scan to add, and the expanded uncertainty that it reaches
     calibration: that corrected the heights; where it was rejected they are not valid
     largest: contribution to ``expanded`` where it is too large
     """
@@ -254,6 +253,10 @@ def verdict_of(
     if too_large:
         limit = float("nan") if accuracy is None else accuracy
         reasons.append(Reason(UNCERTAINTY, (), expanded, limit, largest))
+    add, reached = "", float("nan")
+    if not is_redundant or (too_large and not contradictions):
+        best, reached = best_addition()
+        add = best if not is_redundant or reached < expanded else ""
     if rejected:
         code = INVALID
     elif contradictions:
@@ -264,4 +267,4 @@ def verdict_of(
         code = NOT_VERIFIED
     else:
         code = VERIFIED
-    return Verdict(code, tuple(reasons), resting[0], *addition, resting[1])
+    return Verdict(code, tuple(reasons), resting[0], add, reached, resting[1])

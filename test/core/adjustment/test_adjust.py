@@ -126,14 +126,16 @@ def test_corrected_heights_are_the_part(table):
     assert np.std(raw) > 3 * np.std(left)
 
 
-@pytest.mark.soak
 def test_accuracy_beyond_reach_is_too_uncertain(table):
+    """The verdict then says which scan helps, although two scans verify each other."""
     _, scans, _ = table
     found = adjust(scans[:2], PRIORS, nominal=MIRROR, accuracy=2e-9)
     assert found.verdict.code == TOO_UNCERTAIN
     reason = found.verdict.reasons[-1]
     assert reason.code == "uncertainty"
     assert reason.value == pytest.approx(2 * found.form.pv.uncertainty)
+    assert found.verdict.add
+    assert 0.5 * reason.value < found.verdict.reached < reason.value
 
 
 @pytest.mark.soak

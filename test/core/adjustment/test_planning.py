@@ -13,6 +13,7 @@ from omsm_ros.core.adjustment import (
     posterior_uncertainty,
     usual_sets,
 )
+from omsm_ros.core.adjustment.figures import POSE
 from omsm_ros.core.adjustment.planning import additions, best_addition, design_of
 
 FIRST = ScanDesign(rpm=30.0, start=RADIUS_M, end=0.0, pitch=0.4e-3)
@@ -115,10 +116,10 @@ def test_a_design_goes_beyond_the_centre_as_its_scan_does():
 def test_the_best_addition_is_the_best_of_all():
     machine = Machine(1)
     scan = machine.scan(30)
-    code, reached = best_addition([scan], PRIORS, MIRROR)
+    code, reached = best_addition([scan], PRIORS, MIRROR, POSE, form)
     first = design_of(scan)
-    alone = posterior_uncertainty([first], PRIORS, MIRROR).pv
+    alone = posterior_uncertainty([first], PRIORS, MIRROR, POSE, form).pv
     for added in additions(first).values():
-        assert reached <= 2 * posterior_uncertainty([first, added], PRIORS, MIRROR).pv
+        assert reached <= 2 * posterior_uncertainty([first, added], PRIORS, MIRROR, POSE, form).pv
     assert reached < 0.3 * 2 * alone
     assert code != "repeated_track"
