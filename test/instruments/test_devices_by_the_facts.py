@@ -330,9 +330,15 @@ def test_a_flipped_bit_in_the_counter_of_a_block_renumbers_nothing(bit: int) -> 
         counter = 1000 + 10 * n
         frames = [wires.little(50_000 + k, 4) for k in range(10)]
         script.append(wires.block(flags, counter ^ (1 << bit if n == 9 else 0), frames))
-    driver = ConfocalDtEthernetDevice(Script(*script), ConfocalDtSettings(trigger="each"))
+    now = 0.0
+    driver = ConfocalDtEthernetDevice(
+        Script(*script), ConfocalDtSettings(trigger="each"), lambda: round(now * 1e9), lambda: now
+    )
     driver.open()
-    found = [pair.distance for _ in script for pair in driver.poll(0.0)]
+    found = []
+    for _ in script:
+        now += 0.01
+        found += [pair.distance for pair in driver.poll(0.0)]
     found += [pair.distance for pair in driver.close()]
     assert found[0].first_sample == 1000
     assert found[-1].end == 1200
