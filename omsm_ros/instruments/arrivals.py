@@ -53,13 +53,12 @@ class DeviceClock:
     """
 
     def __init__(self) -> None:
-        self._last_stamp: int | None = None
+        self._last_stamp = -(1 << 63)  # before any time
         self.restart()
 
     def restart(self) -> None:
         """Forget all arrivals, as after a restart of the device's clock; stamps still rise."""
-        # Begin of each span [device], device time and delay of its earliest arrival, after the
-        # origin [s].
+        # After the origin: begin of each span [device], and of its earliest arrival time and delay.
         self._spans: deque[tuple[float, float, float]] = deque(maxlen=round(WINDOW_S / _SPAN_S))
         self._origin = self._newest = (0, 0)
         self._offset = self._slope = self._usual = 0.0
@@ -101,10 +100,8 @@ class DeviceClock:
         since = device_ns - self._origin[0]
         late = self._offset + self._slope * (since * NANOSECOND_S)
         stamp = self._origin[1] + since + round(late * NANOSECONDS_PER_S)
-        if self._last_stamp is not None:
-            stamp = max(stamp, self._last_stamp + 1)
-        self._last_stamp = stamp
-        return stamp
+        self._last_stamp = max(stamp, self._last_stamp + 1)
+        return self._last_stamp
 
     def _keep(self, device: float, late: float) -> None:
         """Enter an arrival; the line is fitted when a span ends, and is never above an arrival."""
@@ -208,12 +205,20 @@ class MissedTriggerDetector:
     def __init__(self, period: float, pause: float = math.inf) -> None:
         """period: of the trigger [s];  pause: arrivals late by half of it may be after a pause."""
         self._period, self._pause = period, pause
-        self._counted = 0
+        self._counted, self._ahead = 0, 0.0
         self.restart()
 
-    def restart(self) -> None:
-        """Forget all arrivals, as after a restart of the device."""
-        self._reference = _Reference(self._period)
+    def restart(self, ahead: float | None = None) -> None:
+        """Forget all arrivals, as after a restart of the device.
+
+        ahead: by how much a counter fell back that was reset in a running stream [s]; an arrival in
+            time without the reset shows that no trigger was missed at it
+        """
+        self._reset = ahead is not None and self._reference.proven and self.trusts_last()
+        if self._reset:  # until an arrival confirms that the trigger went on
+            self._ahead += ahead or 0.0
+            return
+        self._reference: _Reference = _Reference(self._period)
         self._after_pause: _Reference | None = None
         self._newest = self._paused = 0.0  # last arrival, and last one before the silence [s]
         self.resumed, self.lost = -math.inf, False
@@ -224,23 +229,26 @@ class MissedTriggerDetector:
         due: count times period [s];  arrival: monotonic [s]
         after_silence: of the trigger, the line or the host
         """
+        due += self._ahead
         excess = self._reference.excess(due, arrival)
+        jumped = self._reference.proven and (self._reset or excess < 0)
         if abs(excess) <= self._pause / 2:
             self._after_pause = None
-        elif after_silence or (self._reference.proven and excess < 0):
+        elif after_silence or (jumped and not self._after_pause):
             self._paused = self._paused if self._after_pause else self._newest
             self._after_pause = _Reference(self._period)
         self._newest = arrival
         if self._after_pause is None:
             confirmed = self._reference.confirms(due, arrival)
             self.lost |= self._reference.lost
+            self._reset &= not confirmed
             return confirmed and not self.lost
         if not self._after_pause.confirms(due, arrival):
             return False
         # Its line says nothing of triggers missed before the pause.
         self._counted += self._reference.missed
         self.lost |= not self._reference.trusted_until(self._paused)
-        self._reference, self._after_pause = self._after_pause, None
+        self._reference, self._after_pause, self._reset = self._after_pause, None, False
         self.resumed = self._reference.begin
         return not self.lost
 
@@ -270,6 +278,7 @@ class MissedTriggerDetector:
         reference = self._after_pause or self._reference
         found, reference.found = reference.found, 0
         self._counted += found
+        self.lost |= self._reset and found > 0  # before the reset or after it
         return found
 
 

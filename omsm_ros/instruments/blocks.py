@@ -113,7 +113,7 @@ class BlockCutter:
         # Device time less that of the count, and arrival, of the last samples [ns].
         self._usual: tuple[int, int] | None = None
         self._due = self._doubtful = self._latest = 0  # time by the count; offset to be confirmed
-        self._skipped = 0  # counts left out for missed triggers
+        self._skipped = self._end = 0  # counts left out for missed triggers; the next count
         self.unconfirmed = False
         self.delivered = self.withheld = self.blocks = self.period_warnings = self.resets = 0
         self.period_deviation = 0.0
@@ -162,13 +162,18 @@ class BlockCutter:
         if self.detector is None or not runs:
             yield from self._cut(runs, arrival_ns, after_silence)
             return
-        if any(run.restarted for run in runs):
-            self.withhold()
-            self._skipped = 0
-            self.detector.restart()
-        runs = [replace(run, first_sample=run.first_sample + self._skipped) for run in runs]
-        self._waiting.append((now, arrival_ns, after_silence, runs))
-        due = (runs[-1].first_sample + len(runs[-1].samples) - 1) * self._settings.sample_period
+        period, together = self._settings.sample_period, list[CountedRun]()
+        self._waiting.append((now, arrival_ns, after_silence, together))
+        for i, run in enumerate(runs):
+            if run.restarted:
+                ahead = (self._end - run.first_sample) * period
+                self.detector.restart(None if after_silence and i == 0 else ahead)
+                self.withhold()
+                self._waiting.append((now, arrival_ns, after_silence, together := []))
+                self._skipped = 0
+            together.append(replace(run, first_sample=run.first_sample + self._skipped))
+            self._end = together[-1].first_sample + len(run.samples)
+        due = (self._end - 1) * period
         if self.detector.confirms(due, now, after_silence=after_silence):
             yield from self._release(self.detector)
         elif missed := self.detector.forget_missed():

@@ -338,13 +338,18 @@ def test_a_trigger_missed_by_single_samples_is_seen_whatever_the_drift(
 
 
 def cut(
-    missed_at: float = np.inf, stall: float = np.inf, pause: float = np.inf, level: float = 0.0
+    missed_at: float = np.inf,
+    stall: float = np.inf,
+    pause: float = np.inf,
+    level: float = 0.0,
+    reset: int = 100_000,
 ) -> tuple[np.ndarray, np.ndarray, BlockCutter]:
     """Return counts and true triggers of the samples of axes that a cutter hands over in 12 s.
 
     Two triggers are missed. The host stands still for 0.5 s, or the trigger does.
 
     level: mean delay of most arrivals by a host that is busy now and then [s]
+    reset: sample from which the device, and the true triggers, count from zero again
     """
     random = np.random.default_rng(5)
     cutter = BlockCutter(
@@ -362,10 +367,15 @@ def cut(
             continue
         samples = np.zeros(end - read, SAMPLE)
         counts = np.arange(read, end)
-        samples["counts"][:, 0] = counts + 2 * (counts >= missed_at / PERIOD)
-        run = CountedRun(samples, read, False)
+        triggers = counts + 2 * (counts >= missed_at / PERIOD)
+        samples["counts"][:, 0] = triggers - reset * (counts >= reset)
+        runs = [
+            CountedRun(samples[part], int(counts[part][0]) - first, counts[part][0] == reset)
+            for part, first in ((counts < reset, 0), (counts >= reset, reset))
+            if part.any()
+        ]
         at, after = UPTIME_S + now, now - heard > 0.2
-        for axes, _ in cutter.add([run], round(at * 1e9), at, after_silence=after):
+        for axes, _ in cutter.add(runs, round(at * 1e9), at, after_silence=after):
             triggers = np.rint(axes.x * AXIS_SCALING[0].counts_per_unit).astype(int)
             published.append(np.array([np.arange(axes.first_sample, axes.end), triggers]))
         heard, read = now, end
@@ -399,6 +409,41 @@ def test_after_a_pause_of_the_trigger_only_a_doubt_before_it_withholds(
     np.testing.assert_array_equal(counts, triggers)
     assert (counts[-1] > 11_000) == resumes
     assert cutter.unconfirmed != resumes
+
+
+def test_a_counter_reset_in_a_running_stream_costs_only_the_portion_before_it() -> None:
+    counts, triggers, cutter = cut(reset=5003)
+    np.testing.assert_array_equal(counts, triggers)
+    begin = int(np.argmin(np.diff(counts))) + 1
+    assert counts[begin] == 0
+    assert cutter.withheld == 5003 - begin < 10
+
+
+@pytest.mark.parametrize(("pause", "within"), [(0.0, 5), (0.1503, 100)])
+def test_an_arrival_in_time_after_a_reset_confirms_at_once(pause: float, within: int) -> None:
+    """If the trigger pauses at the reset, for no longer than a busy host, the line is new."""
+    random, detector, reset = np.random.default_rng(7), MissedTriggerDetector(PERIOD, 0.2), 4_000
+    polls = np.arange(1, 501) * 0.01 + random.uniform(0, 5e-3, 500)
+    confirmed, before = [], 0
+    for poll in polls:
+        count = int(min(poll, max(poll - pause, reset * PERIOD)) / PERIOD)
+        if count >= reset > before:
+            detector.restart(ahead=reset * PERIOD)
+        if count > before:
+            due = (count - reset * (count >= reset)) * PERIOD
+            confirmed.append((poll, detector.confirms(due, UPTIME_S + poll)))
+        before = count
+    later = [confirms for poll, confirms in confirmed if poll > reset * PERIOD]
+    assert any(later[:within])
+    assert any(later[:5]) == (pause == 0)
+
+
+@pytest.mark.parametrize("level", [0.0, 0.005])
+@pytest.mark.parametrize("after", [0.0, 0.002, 1.0])
+def test_a_trigger_missed_at_or_after_a_reset_is_seen(after: float, level: float) -> None:
+    counts, triggers, cutter = cut(reset=5003, missed_at=5.003 + after, level=level)
+    np.testing.assert_array_equal(counts, triggers)
+    assert cutter.unconfirmed or cutter.detector.missed == 2
 
 
 def test_arrivals_on_a_grid_of_half_a_period_do_not_hide_a_missed_trigger() -> None:
