@@ -213,7 +213,9 @@ def _by_counter(
             tolerance=STAMP_TOLERANCE_S,
         )
     own = replace(trigger, counter_offset=0)
-    z, *others = (_filled(row, grid.known) for row in grid.positions)
+    z, *others = np.zeros_like(grid.positions)
+    if len(known := np.flatnonzero(grid.known)):
+        z, *others = (np.interp(np.arange(len(grid)), known, row[known]) for row in grid.positions)
     named = zip(further, others, strict=True)
     return MotionRecord(
         sample_period=period,
@@ -240,13 +242,6 @@ def _counts(grid: _Grid, probe: StreamAccount) -> dict[str, int]:
         "not_ok": lost.get("invalid", 0),
         "paired": probe.corrected,
     }
-
-
-def _filled(z: FloatArray, known: BoolArray) -> FloatArray:
-    if np.all(known) or not np.any(known):
-        return np.where(known, z, 0.0)
-    index = np.arange(len(z))
-    return np.asarray(np.interp(index, index[known], z[known]))
 
 
 def _by_stamp(

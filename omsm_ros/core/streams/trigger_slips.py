@@ -196,12 +196,12 @@ class TriggerSlipDetector:
         self._apart_ns, self._apart = 0.0, TriggerSlip()
         if sessions != self.sessions:
             self._restart(sessions, first)
-        for line, session in zip(self._lines, sessions, strict=True):
+        lines = tuple(zip(self._lines, sessions, strict=True))
+        for line, session in lines:
             line.advance(session, first - 1)
-        while (count := self._next(end)) < end:
-            pairs = zip(self._lines, sessions, strict=True)
+        while (count := min(line.next_in(session, end) for line, session in lines)) < end:
             if self.same_stamps or any(
-                line.step_to(s, count, period_ns) >= PAUSE_NS for line, s in pairs
+                line.step_to(s, count, period_ns) >= PAUSE_NS for line, s in lines
             ):
                 yield count, self.end()
             before = self._state.samples
@@ -211,8 +211,7 @@ class TriggerSlipDetector:
                 self._shown = [count, count]
             else:
                 yield self._agreed_until(count, period_ns), False
-        pairs = zip(self._lines, sessions, strict=True)
-        stamped = all(line.stamp_of(s, first, period_ns) is not None for line, s in pairs)
+        stamped = all(line.stamp_of(s, first, period_ns) is not None for line, s in lines)
         if self.same_stamps or self._state.samples or not stamped:
             yield end, bool(self._state.samples)
 
@@ -249,10 +248,6 @@ class TriggerSlipDetector:
         """Return whether ``skew`` (n,) [ns] may be that of a slip that was not found."""
         beyond = abs(median(skew)) >= self._steady() * self._period_ns
         return beyond and not self._state.samples
-
-    def _next(self, end: int) -> int:
-        pairs = zip(self._lines, self.sessions, strict=True)
-        return min(line.next_in(session, end) for line, session in pairs)
 
     def _observe(self, count: int, period_ns: float) -> None:
         """Take the skew at ``count``, where a block of either stream begins."""

@@ -272,7 +272,10 @@ class LineDecoder:
         self._kept += sum(len(line) + 1 for line, fit in zip(good, fits, strict=True) if fit)
         self._telegrams += len(values)
         self._tail = tail[:MAX_TELEGRAM_BYTES]  # a longer line is not valid
-        return self._records(values)
+        made = self._layout.records(len(values))
+        for number, column in zip(self._layout.signals, values.T, strict=True):
+            made[str(number)] = column
+        return made
 
     def settle(self) -> Records:
         """Return no telegram, shape (0,): a line has its own end."""
@@ -289,12 +292,6 @@ class LineDecoder:
         lowest, highest, whole = self._limits
         inside = (values >= lowest) & (values <= highest)
         return np.asarray((inside & (~whole | (values == np.rint(values)))).all(axis=1))
-
-    def _records(self, values: FloatArray) -> Records:
-        made = self._layout.records(len(values))
-        for number, column in zip(self._layout.signals, values.T, strict=True):
-            made[str(number)] = column
-        return made
 
 
 def _limits(layout: Layout) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
@@ -408,7 +405,7 @@ class DollarStream:
         place = held.find(echo)
         if place < 0:
             # Keep a possible beginning of the echo.
-            keep = _overlap(held, echo)
+            keep = max(n for n in range(len(echo)) if held.endswith(echo[:n]))
             found += self._decode(self._held[: len(self._held) - keep])
             self._held = self._held[len(self._held) - keep :]
             return False
@@ -437,11 +434,3 @@ class DollarStream:
             return [self.decoder.feed(data)]
         self.last_outside = (self.last_outside + data)[-64:]
         return []
-
-
-def _overlap(data: bytes, word: bytes) -> int:
-    """Return the length of the longest end of ``data`` that begins ``word``."""
-    for length in range(min(len(data), len(word) - 1), 0, -1):
-        if data.endswith(word[:length]):
-            return length
-    return 0

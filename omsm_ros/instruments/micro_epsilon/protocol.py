@@ -96,13 +96,9 @@ def confocal_dtype(flags: tuple[int, int]) -> np.dtype[np.void]:
             fields.append((f"intensity {peak}", 4))
     for word, table in ((flags[0], AFTER_PEAKS), (flags[1], FLAGS_2)):
         fields += [(name, size) for bit, name, size in table if word >> bit & 1]
-    return np.dtype([(name, _format(name, size)) for name, size in fields])
-
-
-def _format(name: str, size: int) -> str:
-    if size == _VIDEO_BYTES:
-        return f"V{size}"
-    return "<i4" if name.startswith(_SIGNED) else "<u4"
+    whole = {name: "<i4" if name.startswith(_SIGNED) else "<u4" for name, _ in fields}
+    opaque = {name: f"V{size}" for name, size in fields if size == _VIDEO_BYTES}
+    return np.dtype(list((whole | opaque).items()))
 
 
 def intensity_leads(words: NDArray[np.int64], furthest: float) -> bool | None:
