@@ -4,7 +4,6 @@ They are looked for in the residuals of a first fit. Each finding becomes a fami
 columns, and is tested as all others are.
 """
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -112,31 +111,20 @@ def _wave(turned: float) -> Columns:
     return lambda v: np.stack([np.cos(turned * v.since), np.sin(turned * v.since)])
 
 
-@dataclass(frozen=True)
-class _Step:
-    """A change from one turn to the next at ``time`` in scan ``scan`` [s].
-
-    kind: "height_step" of the height, or "c_lost" of the angle;  deviate: in standard deviations
-    """
-
-    scan: int
-    kind: str
-    time: float
-    deviate: float
-
-
 def steps_of(solution: Solution, scan: int) -> list[Family]:
     """Return the largest step of the height and of the angle, where they stand out.
 
     The angle is compared from turn to turn, so a scan within one turn shows no step of it.
     """
-    found = [_height_step(solution, scan)]
+    found = {"height_step": _height_step(solution, scan)}
     if np.any(solution.network.blocks.turn[solution.network.blocks.scan == scan]):
-        found.append(_angle_step(solution, scan))
-    return [_family_of(step) for step in found if step.deviate > _STEP_LIMIT]
+        found["c_lost"] = _angle_step(solution, scan)
+    return [_after(time, kind, scan) for kind, (time, deviate) in found.items()
+            if deviate > _STEP_LIMIT]  # fmt: skip
 
 
-def _height_step(solution: Solution, scan: int) -> _Step:
+def _height_step(solution: Solution, scan: int) -> tuple[float, float]:
+    """Return the time [s] and the deviate of the largest change from one turn to the next."""
     net = solution.network
     here, width = net.knots[scan], net.steps[scan]
     moves = np.diff(solution.values[here])
@@ -146,7 +134,7 @@ def _height_step(solution: Solution, scan: int) -> _Step:
     since = net.blocks.since[mine]
     left = (solution.residual() + net.of_drift(solution.values))[mine]
     window = (since > (knot - 1) * width) & (since < (knot + 2) * width)
-    return _Step(scan, "height_step", _break(since[window], left[window]), float(size[knot]))
+    return _break(since[window], left[window]), float(size[knot])
 
 
 def _break(time: FloatArray, values: FloatArray) -> float:
@@ -159,7 +147,7 @@ def _break(time: FloatArray, values: FloatArray) -> float:
     return float((time[best] + time[best + 1]) / 2)
 
 
-def _angle_step(solution: Solution, scan: int) -> _Step:
+def _angle_step(solution: Solution, scan: int) -> tuple[float, float]:
     net = solution.network
     mine = net.blocks.scan == scan
     turn, left = net.blocks.turn[mine], solution.residual()[mine]
@@ -185,20 +173,19 @@ def _angle_step(solution: Solution, scan: int) -> _Step:
     window = (since >= begin) & (since <= end)
     # From there on the column is found in what is left with another coefficient.
     time = _break(since[window], left[window] * np.sign(centred[window]))
-    return _Step(scan, "c_lost", time, float(size[best]))
+    return time, float(size[best])
 
 
-def _family_of(step: _Step) -> Family:
-    """Return what a step of height or angle does from its time on."""
+def _after(time: float, kind: str, scan: int) -> Family:
+    """Return what a step of height or angle does from its ``time`` [s] on."""
 
     def columns(v: ScanView) -> FloatArray:
-        after = (v.since > step.time).astype(np.float64)
-        shape = after if step.kind == "height_step" else after * v.lateral_error(-v.y, v.x)
+        after = (v.since > time).astype(np.float64)
+        shape = after if kind == "height_step" else after * v.lateral_error(-v.y, v.x)
         return np.asarray(shape[np.newaxis])
 
-    unit, wide = ("m", _HEIGHT_STEP_M) if step.kind == "height_step" else ("rad", _C_LOST_RAD)
-    name = f"{step.kind}@{step.scan}"
-    return Family(name, unit, 1, only(step.scan, 1, columns), wide, REPEATED_TRACK)
+    unit, wide = ("m", _HEIGHT_STEP_M) if kind == "height_step" else ("rad", _C_LOST_RAD)
+    return Family(f"{kind}@{scan}", unit, 1, only(scan, 1, columns), wide, REPEATED_TRACK)
 
 
 def follows_removed(view: ScanView) -> float | None:
