@@ -264,6 +264,7 @@ def _show_scans(facts: Facts) -> None:
                 for k, path in enumerate(facts["paths"])
             ),
             ("chosen", f"{facts['set']}, which {reached} {quantity(facts['accuracy'], 'm', 2)}"),
+            *([("", facts["largest"])] if facts["largest"] else ()),
             written(facts["files"]),
         ]
     )

@@ -36,9 +36,9 @@ verdict.looks_like: the form ({value:m/2} rms of it) looks like {names}, which t
     tell from the part; {remedy}, or accept it as the form of the part with omsm adjust --accept
 verdict.uncertainty: expanded uncertainty {value:m/2}, larger than the accuracy of {limit:m/2} asked
     for{contribution}
-verdict.shrink: ; the largest contribution is {name}: its standard uncertainty of {size} would have
+verdict.shrink: the largest contribution is {name}: its standard uncertainty of {size} would have
     to shrink to {allowed}
-verdict.remain: ; the largest contribution is {name}, standard uncertainty {size}; without it the
+verdict.remain: the largest contribution is {name}, standard uncertainty {size}; without it the
     expanded uncertainty would still be {rest:m/2}
 verdict.add_other_speed: scan the part again at twice the speed, from the centre outward
 verdict.add_other_direction: scan the part again with the spindle reversed

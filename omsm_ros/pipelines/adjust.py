@@ -22,6 +22,7 @@ from omsm_ros.core.adjustment import (
     adjust,
 )
 from omsm_ros.core.adjustment.adjust import corrected_heights
+from omsm_ros.core.adjustment.sources import Contribution
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import (
@@ -436,15 +437,18 @@ def _values(reason: Reason) -> Mapping[str, Any]:
     joined = (", " if reason.code in _OPEN else " or ").join(texts)
     possible = ", ".join(dict.fromkeys(filter(None, known)))
     declare = sentence("verdict.declare", {"names": possible}) if possible else ""
-    contribution = ""
-    if (largest := reason.largest) is not None:
-        code = "verdict.remain" if math.isnan(largest.allowed) else "verdict.shrink"
-        size, allowed = (sized(v, largest.unit, 2) for v in (largest.size, largest.allowed))
-        name = f"{source_name(largest.name)} ({largest.name})"
-        parts = {"name": name, "size": size, "allowed": allowed, "rest": largest.rest}
-        contribution = sentence(code, parts)
+    contribution = "" if reason.largest is None else "; " + contribution_text(reason.largest)
     return {"names": joined, "value": reason.value, "limit": reason.limit, "remedy": remedy,
             "declare": declare, "contribution": contribution}  # fmt: skip
+
+
+def contribution_text(largest: Contribution) -> str:
+    """Return which source contributes most to an uncertainty, and what would have to shrink."""
+    code = "verdict.remain" if math.isnan(largest.allowed) else "verdict.shrink"
+    size, allowed = (sized(v, largest.unit, 2) for v in (largest.size, largest.allowed))
+    name = f"{source_name(largest.name)} ({largest.name})"
+    parts = {"name": name, "size": size, "allowed": allowed, "rest": largest.rest}
+    return sentence(code, parts)
 
 
 def _in_file(family: str) -> str:

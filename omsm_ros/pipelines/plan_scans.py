@@ -19,7 +19,7 @@ from omsm_ros.core.surface.aperture import BoundedSurface
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.files import save_text
 from omsm_ros.io.gcode_file import path_gcode
-from omsm_ros.pipelines.adjust import priors_of
+from omsm_ros.pipelines.adjust import contribution_text, priors_of
 from omsm_ros.units import RPM_RAD_S
 
 # Largest distance of an executed path from the surface [m], and cycle of the planner's servo [s].
@@ -112,6 +112,7 @@ def plan_facts(
         "set": best.name,
         "reaches": best.reaches,
         "accuracy": accuracy,
+        "largest": None if (most := best.uncertainty.largest) is None else contribution_text(most),
         "sets": [
             {
                 "name": planned.name,

@@ -36,6 +36,14 @@ def test_the_shortest_verifiable_set_that_reaches_is_chosen(capsys, nominal, tmp
     assert reached["full"] < reached["quick"] < reached["single"]
 
 
+def test_where_no_set_reaches_the_accuracy_a_source_is_named(capsys, nominal, tmp_path):
+    words = ("--nominal", nominal, "--out", tmp_path, "--radius", 3e-3, "--accuracy")
+    found = planned(capsys, *words, 1e-10)
+    assert not found["reaches"]
+    assert "the largest contribution is" in found["largest"]
+    assert planned(capsys, *words, 1e-6)["largest"] is None
+
+
 def test_the_programs_follow_the_nominal_surface(capsys, nominal, tmp_path):
     found = planned(capsys, "--nominal", nominal, "--out", tmp_path, "--radius", 3e-3)
     table = np.genfromtxt(tmp_path / "scan_2.csv", delimiter=",", names=True)

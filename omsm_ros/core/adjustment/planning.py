@@ -20,12 +20,19 @@ from omsm_ros.core.adjustment.families import (
     families_of,
     ranges_of,
 )
-from omsm_ros.core.adjustment.figures import POSE, FormOf, figure, pv_of
+from omsm_ros.core.adjustment.figures import (
+    POSE,
+    FormOf,
+    effects_on_form,
+    figure,
+    largest_contribution,
+    pv_of,
+)
 from omsm_ros.core.adjustment.network import Network, Scales, solve
 from omsm_ros.core.adjustment.part_terms import START_POWER, part_model
 from omsm_ros.core.adjustment.refutation import completed
 from omsm_ros.core.adjustment.scan_data import ARRAYS, LEAST_POINTS, ScanData, view_of, zero_of
-from omsm_ros.core.adjustment.sources import Source, prior_sizes
+from omsm_ros.core.adjustment.sources import Contribution, Source, prior_sizes
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.aperture import BoundedSurface
@@ -87,11 +94,13 @@ class PlannedUncertainty:
     pv: standard uncertainty of PV, its pose removed, of the form or that nine of ten reach [m]
     sources: of each family that takes part, standard uncertainty after the scans [unit]
     duration: of all scans and the pauses between them [s]
+    largest: contribution to ``pv``, and what it may be for the accuracy asked for
     """
 
     pv: float
     sources: Mapping[str, FloatArray]
     duration: float
+    largest: Contribution | None = None
 
 
 class PlannedSet(NamedTuple):
@@ -109,11 +118,12 @@ def posterior_uncertainty(
     nominal: Surface,
     removed: Sequence[str] = POSE,
     form: Form | None = None,
+    accuracy: float | None = None,
 ) -> PlannedUncertainty:
     """Return what ``designs``, adjusted together, will leave uncertain.
 
     priors: declared sources, ``noise`` [m] and ``drift_walk`` [m/√s] among them
-    form: form error of the part [m]; None: not known
+    form: form error of the part [m]; None: not known;  accuracy: asked for, k = 2 [m], or None
     """
     scans, begin = [], 0.0
     shorter = max(1.0, max(d.turns for d in designs) / _MOST_TURNS)
@@ -138,15 +148,23 @@ def posterior_uncertainty(
         noise=np.ones(len(scans)),
     )
     solution = solve(Network(blocks, families, part), np.zeros(len(blocks)), scales, sizes)
+    made = FormOf.of(completed(solution), nominal, removed)
+    pv, height = _of_pv(made, form)
+    largest = None
+    if accuracy is not None:
+        made = replace(made, height=height)
+        largest = largest_contribution(made, effects_on_form(made), (), (), accuracy)
     return PlannedUncertainty(
-        pv=_of_pv(FormOf.of(completed(solution), nominal, removed), form),
+        pv=pv,
         sources={f.name: solution.uncertainty(f.name) for f in families if f.name in sizes},
         duration=begin - _PAUSE_S,
+        largest=largest,
     )
 
 
-def _of_pv(made: FormOf, form: Form | None) -> float:
-    """Return the standard uncertainty of PV of ``form``, or what ``_SHARE`` of all reach [m]."""
+def _of_pv(made: FormOf, form: Form | None) -> tuple[float, FloatArray]:
+    """Return the standard uncertainty of PV of ``form``, or what ``_SHARE`` of all reach [m], and
+    the form that has it (n,) [m]."""
     part, places = made.solution.network.part, made.places
     sizes = np.array([t.n ** (-START_POWER / 2) if t.n > 1 else 0.0 for t in part.terms])
     terms = part.values(places.x, places.y)[:, : len(sizes)] * sizes
@@ -155,7 +173,9 @@ def _of_pv(made: FormOf, form: Form | None) -> float:
     if form is not None:
         forms = made.free(form(places.x, places.y)[:, np.newaxis])
     errors = made.free(made.errors()[0])
-    return float(np.quantile([figure(f, errors, pv_of).uncertainty for f in forms.T], _SHARE))
+    found = np.array([figure(f, errors, pv_of).uncertainty for f in forms.T])
+    reached = float(np.quantile(found, _SHARE))
+    return reached, forms[:, np.argmin(np.abs(found - reached))]
 
 
 def plan_scans(
@@ -167,7 +187,7 @@ def plan_scans(
     """Return the sets of scans, the shortest that reaches ``accuracy`` [m] (k = 2) first.
 
     Those that do not reach it follow, the most accurate first, and single scans come last: nothing
-    verifies them.
+    verifies them. If none does, the first one has its ``largest`` contribution.
     """
 
     def order(one: PlannedSet) -> tuple[bool, bool, float]:
@@ -178,7 +198,11 @@ def plan_scans(
     for name, designs in candidates.items():
         planned = posterior_uncertainty(designs, priors, nominal)
         found.append(PlannedSet(name, designs, planned, 2 * planned.pv <= accuracy))
-    return tuple(sorted(found, key=order))
+    best, *others = sorted(found, key=order)
+    if not best.reaches:
+        planned = posterior_uncertainty(best.designs, priors, nominal, accuracy=accuracy)
+        best = best._replace(uncertainty=planned)
+    return best, *others
 
 
 def usual_sets(first: ScanDesign) -> dict[str, tuple[ScanDesign, ...]]:
