@@ -22,6 +22,7 @@ from omsm_ros.core.adjustment import (
     adjust,
 )
 from omsm_ros.core.adjustment.adjust import corrected_heights
+from omsm_ros.core.adjustment.scan_data import within
 from omsm_ros.core.adjustment.sources import Contribution
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions
@@ -36,6 +37,7 @@ from omsm_ros.core.correction.systematic import EVALUATED
 from omsm_ros.core.form.deviation_map import Doubt, UncertainValue, conformity
 from omsm_ros.core.kinematics.kinematics import Surface, workpiece_xy
 from omsm_ros.core.streams.blocks import Account
+from omsm_ros.core.surface.aperture import within_aperture
 from omsm_ros.core.surface.deviation import mismatch
 from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.io.files import REPORT, save_json, save_text
@@ -211,8 +213,9 @@ def adjust_bags(
         for bag, (turn, again) in zip(bags, places, strict=True)
     ]
     scans = on_one_clock(_checked(scans, nominal))
+    area = None if nominal is None else within_aperture(nominal, None)[1]
     return adjust(
-        [scan.data for scan in scans],
+        [within(scan.data, area) if area else scan.data for scan in scans],
         priors_of(stated, options.geometry.abbe_arm),
         calibration=calibration,
         nominal=nominal,

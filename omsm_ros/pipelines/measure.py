@@ -16,7 +16,7 @@ from omsm_ros import __version__
 from omsm_ros.core.adjustment import Verdict, adjust
 from omsm_ros.core.adjustment.families import OTHER_SPEED
 from omsm_ros.core.adjustment.figures import POSE
-from omsm_ros.core.adjustment.scan_data import ARRAYS, ScanData
+from omsm_ros.core.adjustment.scan_data import within
 from omsm_ros.core.adjustment.verdict import verdict_of
 from omsm_ros.core.calibration.calibration import Calibration, age_at, excess_latency_text
 from omsm_ros.core.calibration.calibration_set import CalibrationSet
@@ -35,7 +35,7 @@ from omsm_ros.core.correction.systematic import resolves_per_turn_waves, scan_fi
 from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.lti.discretisation import discretisation_error, discretise
-from omsm_ros.core.surface.aperture import Aperture, within_aperture
+from omsm_ros.core.surface.aperture import within_aperture
 from omsm_ros.core.surface.deviation import mismatch
 from omsm_ros.core.surface.posed import Pose, PosedSurface
 from omsm_ros.core.surface.shape_parameters import with_parameters
@@ -127,7 +127,10 @@ def add_verdict(
     if register is not None and nominal is not None:
         _, area = within_aperture(nominal, register.aperture)
     if scan is not None and area is not None:
-        scan = _within(scan, area)
+        try:
+            scan = within(scan, area)
+        except DataError:
+            scan = None
     doubts: list[str] = []
     if nominal is not None:
         x, y = (done.points[name].astype(np.float64) for name in "xy")
@@ -154,15 +157,6 @@ def add_verdict(
     if tolerance is not None and (figures := summary.get("figures")):
         summary["conformity"] = conformity_entry(figures, tolerance, (form or {}).get("open", ()))
     summary["verdict"] = verdict_entry(verdict, doubts=doubts)
-
-
-def _within(scan: ScanData, aperture: Aperture) -> ScanData | None:
-    """Return the points within the aperture; None if they are too few for a scan."""
-    kept = aperture.holds(scan.x, scan.y)
-    try:
-        return replace(scan, **{name: getattr(scan, name)[kept] for name in ARRAYS})
-    except DataError:
-        return None
 
 
 def untested_verdict(expanded: float, accuracy: float | None, calibration: Calibration) -> Verdict:

@@ -21,6 +21,7 @@ from omsm_ros.core.kinematics.kinematics import (
     workpiece_xy,
 )
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.errors import DataError
 
 # A turn at 30 rpm holds 2000 points at 1 kHz; two hundred determine neither form nor drift.
@@ -112,6 +113,12 @@ class ScanData:
 
 
 ARRAYS = ("time", "x", "y", "height", "distance", "motion", "removed", "c")
+
+
+def within(scan: ScanData, aperture: Aperture) -> ScanData:
+    """Return the points of ``scan`` over the aperture of the part; DataError if they are few."""
+    kept = aperture.holds(*workpiece_xy(scan.x, scan.y, np.full(len(scan), scan.clocking)))
+    return replace(scan, **{name: getattr(scan, name)[kept] for name in ARRAYS})
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
