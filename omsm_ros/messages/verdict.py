@@ -5,8 +5,9 @@ from omsm_ros.messages import catalogue
 TEMPLATES = catalogue("""
 verdict.verified: verified by {scans:count} scans
 verdict.except: {text}, except for what counts as declared or assumed: {names}
-verdict.rests_on: not shown by these scans, counted as declared or assumed: {names} (in all
-    {value:m/2} of the heights, k = 1). To verify most of it, {remedy}
+verdict.rests_on: not shown by these scans, counted as declared or assumed, in all {value:m/2} of
+    the heights (k = 1)
+verdict.to_verify: To verify {names}, {remedy}
 verdict.not_verified: not verified
 verdict.contradicted: contradicted by the scans
 verdict.too_uncertain: uncertainty too large
@@ -117,7 +118,7 @@ SOURCE_NAMES = {
     "scan_differs": "form that one scan alone shows",
     "height_step": "step of the height",
     "c_lost": "lost counts of C",
-    "sense_of_c": "sense of C (if wrong, the map is mirrored; a part turned on the chuck shows it)",
+    "sense_of_c": "sense of C (if wrong, the map is mirrored)",
 }
 
 

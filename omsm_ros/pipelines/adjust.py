@@ -382,15 +382,19 @@ def verdict_entry(verdict: Verdict, scans: int = 1, doubts: Iterable[str] = ()) 
         ],
     }
     if verdict.rests_on:
-        names = [source_name(name) for name, _ in verdict.rests_on]
-        remedy = sentence(f"verdict.add_{verdict.would_show}", {})
-        size = math.hypot(*(effect for _, effect in verdict.rests_on))
+        names = [source_name(name) for name, _, _ in verdict.rests_on]
+        size = math.hypot(*(effect for _, effect, _ in verdict.rests_on))
+        text = sentence("verdict.rests_on", {"value": size})
+        for shown in dict.fromkeys(by for _, _, by in verdict.rests_on):
+            group = [source_name(name) for name, _, by in verdict.rests_on if by == shown]
+            remedy = sentence(f"verdict.add_{shown}", {})
+            text += ". " + sentence(
+                "verdict.to_verify", {"names": ", ".join(group), "remedy": remedy}
+            )
         entry["rests_on"] = {
-            "names": [name for name, _ in verdict.rests_on],
+            "names": [name for name, _, _ in verdict.rests_on],
             "effect": number(size),
-            "text": sentence(
-                "verdict.rests_on", {"names": ", ".join(names), "value": size, "remedy": remedy}
-            ),
+            "text": text,
         }
         if code == VERIFIED:
             more = f" and {len(names) - 2} more" if len(names) > 2 else ""

@@ -164,7 +164,7 @@ def untested_verdict(expanded: float, accuracy: float | None, calibration: Calib
 
     expanded: uncertainty of the heights, k = 2 [m];  accuracy: asked for [m], None: none
     """
-    return verdict_of((), (), ((), ""), False, expanded, accuracy, lambda: (OTHER_SPEED, np.nan),
+    return verdict_of((), (), (), False, expanded, accuracy, lambda: (OTHER_SPEED, np.nan),
                       calibration)  # fmt: skip
 
 

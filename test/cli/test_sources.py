@@ -153,6 +153,18 @@ def test_an_evaluation_says_from_what(tmp_path, entry, counts):
     assert [s.origin for s in stated.scan_sources()] == [stated.stated[0].origin]
 
 
+def test_a_verdict_says_what_would_verify_each_source_it_rests_on():
+    resting = (("squareness", 3e-9, "beyond_centre"), ("pitch", 2e-9, "reference_artefact"),
+               ("centre_x", 1e-9, "beyond_centre"))  # fmt: skip
+    text = verdict_entry(Verdict("verified", (), resting))["rests_on"]["text"]
+    _, scan, artefact = text.split(". ")
+    assert scan == (
+        "To verify squareness of X to the spindle, spindle centre in x, scan the part again at "
+        "twice the speed, from beyond the centre outward"
+    )
+    assert artefact.endswith("measure a reference artefact")
+
+
 @pytest.mark.parametrize(
     ("family", "declared"),
     [("creep", None), ("probe_square", "probe_linearity"), ("spindle_axial/3", "spindle_axial"),

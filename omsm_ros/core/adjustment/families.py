@@ -197,26 +197,33 @@ def _of_each_direction(r: Ranges) -> list[Family]:
     ]  # fmt: skip
 
 
+# Of the longer way of X from the spindle axis, the way on its other side.
+_BOTH_SIDES = 0.1
+
+
 def _geometric(r: Ranges) -> list[Family]:
     """Centre, squareness, straightness, pitch and scale of the slides."""
+    # What a scan beyond the centre leaves open, only an artefact shows.
+    both_sides = min(-r.slide[0], r.slide[1]) > _BOTH_SIDES * max(-r.slide[0], r.slide[1])
+    beyond = REFERENCE if both_sides else BEYOND_CENTRE
     return [
         *_of_each_direction(r),
         # Scales of glass and good screws; what scans to the centre leave open is not tested.
         _one("expansion", "1", lambda v: v.lateral_error(v.x, v.y), 3e-5, REFERENCE, 5e-6),
         _curve("positioning_x", "m", r.slide, r, lambda v, w: np.stack(
             [v.across(*way) for bow in w(v.slide_x) for way in ((bow, 0.0), (0.0, bow))]),
-            1e-6, BEYOND_CENTRE, 2, 5e-8),
-        _one("centre_x", "m", lambda v: v.across(1.0, 0.0), 2e-5, BEYOND_CENTRE),
-        _one("centre_y", "m", lambda v: v.across(0.0, 1.0), 2e-5, BEYOND_CENTRE),
+            1e-6, beyond, 2, 5e-8),
+        _one("centre_x", "m", lambda v: v.across(1.0, 0.0), 2e-5, beyond),
+        _one("centre_y", "m", lambda v: v.across(0.0, 1.0), 2e-5, beyond),
         Family("parallelism", "rad", 2, lambda v: np.stack(
-            [v.across(v.motion, 0.0), v.across(0.0, v.motion)]), 1e-3, BEYOND_CENTRE),
-        _one("squareness", "rad", lambda v: v.slide_x, 3e-5, BEYOND_CENTRE),
+            [v.across(v.motion, 0.0), v.across(0.0, v.motion)]), 1e-3, beyond),
+        _one("squareness", "rad", lambda v: v.slide_x, 3e-5, beyond),
         _one("encoder_scale", "1", lambda v: v.motion, 1e-4, REFERENCE),
         # A bow that is even in x is power of the part beyond the centre, too.
         _curve("straightness_x", "m", r.slide, r, lambda v, w: w(v.slide_x), 3e-7, REFERENCE),
         _curve("straightness_z", "m", r.lift, r, lambda v, w: np.stack(
             [v.across(*way) for bow in w(v.motion) for way in ((bow, 0.0), (0.0, bow))]),
-            1e-6, BEYOND_CENTRE, 2),
+            1e-6, beyond, 2),
         _curve("pitch", "m", r.lift, r, lambda v, w: w(v.motion), 3e-7, REFERENCE),
     ]  # fmt: skip
 

@@ -10,6 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from omsm_ros.core.adjustment.agreement import ScanAgreement
+from omsm_ros.core.adjustment.families import RECLOCKED
 from omsm_ros.core.adjustment.figures import NO_EFFECT, Effect
 from omsm_ros.core.adjustment.refutation import Refutation
 from omsm_ros.core.adjustment.scan_data import ScanData
@@ -53,18 +54,17 @@ class Verdict:
     """Verdict on the heights, with its reasons.
 
     code: of this module;  reasons: against green, none where it is verified
-    rests_on: declared sources that these scans do not verify, name and standard uncertainty of
-        the heights by each [m], largest first;  would_show: code of what shows most of them
+    rests_on: declared sources that these scans do not verify, name, standard uncertainty of the
+        heights by each [m], and code of what would show it, largest first
     add: code of the one scan to add that helps most, "" where none is needed
     reached: expanded uncertainty (k = 2) of PV with that scan [m]
     """
 
     code: str
     reasons: tuple[Reason, ...]
-    rests_on: tuple[tuple[str, float], ...] = ()
+    rests_on: tuple[tuple[str, float, str], ...] = ()
     add: str = ""
     reached: float = float("nan")
-    would_show: str = ""
 
 
 def redundant(scans: Sequence[ScanData]) -> bool:
@@ -206,28 +206,25 @@ def looks_like(
 
 def rests_on(
     families: Sequence[Family], effects: Mapping[str, Effect], limit: float, mirrored: bool
-) -> tuple[tuple[tuple[str, float], ...], str]:
+) -> tuple[tuple[str, float, str], ...]:
     """Return the sources that count as they were declared, for these scans do not show them.
 
-    Also what each does to the heights as declared, k = 1 [m], the largest first; and the code of
-    the scan or artefact that would show most of that.
+    Also what each does to the heights as declared, k = 1 [m], the largest first, and the code of
+    the scan or artefact that would show it.
     limit: a source that may do more if its declaration is worth nothing is one of them [m]
     mirrored: True if C might count the other way, which makes the mirror image of the form
     """
     # A declared pose among them: it looks like form.
-    found = [f for f in families if effects.get(f.name, NO_EFFECT).free > limit]
-    by: dict[str, float] = {}
-    for family in found:
-        by[family.shown_by] = by.get(family.shown_by, 0.0) + effects[family.name].left ** 2
-    resting = sorted(((f.name, effects[f.name].left) for f in found), key=lambda pair: -pair[1])
-    sense = [(SENSE, 0.0)] if mirrored else []
-    return (*sense, *resting), max(by, key=lambda code: by[code], default="")
+    found = [(f.name, effects[f.name].left, f.shown_by) for f in families
+             if effects.get(f.name, NO_EFFECT).free > limit]  # fmt: skip
+    sense = [(SENSE, 0.0, RECLOCKED)] if mirrored else []
+    return (*sense, *sorted(found, key=lambda one: -one[1]))
 
 
 def verdict_of(
     contradictions: Sequence[Reason],
     open_sources: Sequence[Reason],
-    resting: tuple[tuple[tuple[str, float], ...], str],
+    resting: tuple[tuple[str, float, str], ...],
     is_redundant: bool,
     expanded: float,
     accuracy: float | None,
@@ -267,4 +264,4 @@ def verdict_of(
         code = NOT_VERIFIED
     else:
         code = VERIFIED
-    return Verdict(code, tuple(reasons), resting[0], add, reached, resting[1])
+    return Verdict(code, tuple(reasons), resting, add, reached)

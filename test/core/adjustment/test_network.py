@@ -11,7 +11,7 @@ from plain_world import MIRROR, RADIUS_M, Machine
 from omsm_ros.core.adjustment.adjust import _network
 from omsm_ros.core.adjustment.blocks import SECTORS, block_begins
 from omsm_ros.core.adjustment.evidence import evidence_of
-from omsm_ros.core.adjustment.families import families_of, ranges_of
+from omsm_ros.core.adjustment.families import BEYOND_CENTRE, REFERENCE, families_of, ranges_of
 from omsm_ros.core.adjustment.figures import FormOf, _term_fit, effects_on_form, nodes_of, places_of
 from omsm_ros.core.adjustment.network import Factor, solve, walk_deviate
 from omsm_ros.core.adjustment.part_terms import part_model
@@ -310,6 +310,15 @@ def test_a_declaration_that_the_scans_speak_against_may_be_wrong(small, evidence
     else:
         assert further > 1.5
         assert off < further / 2
+
+
+@pytest.mark.parametrize(("start", "shown_by"), [(0.0, BEYOND_CENTRE), (-0.3, REFERENCE)])
+def test_what_scans_from_both_sides_leave_open_only_an_artefact_shows(start, shown_by):
+    """Advice to scan beyond the centre would go round in a circle."""
+    scan = Machine(1, pitch=1.6e-3).scan(60, start=start * RADIUS_M, end=RADIUS_M)
+    views = [view_of(scan, 0, zero_of([scan], MIRROR), MIRROR)]
+    by = {f.name: f.shown_by for f in families_of(ranges_of(views, (), (0,)), ())}
+    assert {by[name] for name in ("centre_x", "squareness", "straightness_z")} == {shown_by}
 
 
 def test_a_linearity_is_declared_at_its_half_range(small):

@@ -11,6 +11,7 @@ from plain_world import MIRROR
 from soaked import soaked
 
 from omsm_ros.core.adjustment import CONTRADICTED, VERIFIED, Source, adjust
+from omsm_ros.core.adjustment.families import BEYOND_CENTRE, REFERENCE
 from omsm_ros.core.adjustment.verdict import TOO_UNCERTAIN
 
 # Kind, family, its true values (or None where a drawn error adds to it).
@@ -207,10 +208,13 @@ def test_what_spirals_to_the_centre_cannot_show_rests_on_its_declaration():
     """
     _, found = disturbed("clean", 2)
     assert found.verdict.code == VERIFIED
-    resting = dict(found.verdict.rests_on)
+    resting = {name: effect for name, effect, _ in found.verdict.rests_on}
     assert found.verdict.rests_on[0][0] == "sense_of_c"
     assert {"straightness_x", "encoder_scale", "pitch"} <= set(resting)
     assert max(resting.values()) < 10e-9
+    shown = {name: shown_by for name, _, shown_by in found.verdict.rests_on}
+    assert shown["squareness"] == BEYOND_CENTRE
+    assert shown["pitch"] == REFERENCE
 
 
 @pytest.mark.soak
@@ -229,7 +233,7 @@ def test_a_clocking_that_was_declared_counts_as_the_source_that_it_is():
     priors = [p for p in AS_DRAWN if p.name != "clocking"]
     found = adjust(made, [*priors, Source("clocking", 1e-4, evaluated=True)], nominal=MIRROR,
                    accuracy=25e-9)  # fmt: skip
-    assert "clocking" in dict(found.verdict.rests_on)
+    assert "clocking" in [name for name, *_ in found.verdict.rests_on]
     (too_large,) = [r for r in found.verdict.reasons if r.code == "uncertainty"]
     assert too_large.largest.name == "clocking"
     assert too_large.largest.allowed < 0.5e-4
