@@ -51,8 +51,8 @@ correction.slower_dynamics: {better}, or run it at {factor:plain} × this speed
 correction.no_speed: no speed of this path is within the limit of {limit}
 correction.no_speed_dynamics: {better}: no speed of this path is within the limit of {limit}
 correction.better: calibrate better (longer plateaus and more steps, omsm plan steps)
-correction.dwell: calibrate with dwells of {dwell:.2g} s or more (omsm plan steps --dwell
-    {dwell:.2g})
+correction.dwell: calibrate with dwells of {dwell:g} s or more (omsm plan steps --dwell
+    {dwell:g})
 correction.undetected_part: ; {part:m} of it are model errors that the step test cannot detect,
     mostly {mostly}
 """)

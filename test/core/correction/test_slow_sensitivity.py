@@ -14,6 +14,7 @@ from omsm_ros.core.kinematics.limits import MachineLimits
 from omsm_ros.core.kinematics.scan_path import ScanPath
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
+from omsm_ros.messages import sentence
 
 PERIOD, OPEN, VALID_FROM = 1e-3, 1e-4, 0.015
 AMPLITUDE = 0.5e-3
@@ -141,3 +142,8 @@ def test_the_prediction_says_the_same():
     z = AMPLITUDE * np.sin(2 * np.pi * 1.0 * TIME)
     residual = np.sqrt(np.sum(residual_variances(calibration(), PERIOD, z), axis=0))
     assert np.max(residual[-10_000:]) == pytest.approx(OPEN * AMPLITUDE, rel=0.02)
+
+
+def test_a_dwell_of_minutes_is_one_that_the_command_takes():
+    text = sentence("correction.dwell", {"dwell": 130.0})
+    assert text == "calibrate with dwells of 130 s or more (omsm plan steps --dwell 130)"
