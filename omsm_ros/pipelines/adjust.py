@@ -387,10 +387,8 @@ def verdict_entry(verdict: Verdict, scans: int = 1, doubts: Iterable[str] = ()) 
         text = sentence("verdict.rests_on", {"value": size})
         for shown in dict.fromkeys(by for _, _, by in verdict.rests_on):
             group = [source_name(name) for name, _, by in verdict.rests_on if by == shown]
-            remedy = sentence(f"verdict.add_{shown}", {})
-            text += ". " + sentence(
-                "verdict.to_verify", {"names": ", ".join(group), "remedy": remedy}
-            )
+            values = {"names": ", ".join(group), "remedy": sentence(f"verdict.add_{shown}", {})}
+            text += ". " + sentence("verdict.to_verify", values)
         entry["rests_on"] = {
             "names": [name for name, _, _ in verdict.rests_on],
             "effect": number(size),

@@ -65,7 +65,10 @@ def exceeded_limits(
     x, z, c = scan_path(outer, nominal, time)
     path = ScanPath(z=z, sample_period=1 / _JUDGED_HZ, x=x, c=c)
     found, _ = speed_limits(path, limits, _JUDGED_HZ / 2, accuracy)
-    return [limit.name for limit in found if limit.speed_factor < 1]
+    exceeded = [limit.name for limit in found if limit.speed_factor < 1]
+    if limits.x_beyond is not None and ends[0] * ends[1] < 0 and abs(ends[0]) > limits.x_beyond:
+        exceeded.append("travel of X")
+    return exceeded
 
 
 def planned_sets(

@@ -78,6 +78,17 @@ def test_a_planned_motion_runs_at_its_speed_and_is_predicted(
     assert content == pytest.approx(3 * speed[0] / 60, abs=0.2)
 
 
+@pytest.mark.parametrize(("travel", "beyond"), [(0.0, False), (1e-3, True)])
+def test_a_slide_that_ends_at_the_axis_is_not_sent_beyond(
+    travel, beyond, capsys, nominal, tmp_path
+):
+    (tmp_path / "limits.yaml").write_text(f"x_beyond: {travel}\n")
+    words = ("--nominal", nominal, "--out", tmp_path, "--radius", 3e-3)
+    found = planned(capsys, *words, "--limits", tmp_path / "limits.yaml")
+    starts = [scan["start"] for one in found["sets"] for scan in one["scans"]]
+    assert (min(starts) < 0) == beyond
+
+
 @pytest.mark.parametrize("what", ["scans", "motion"])
 def test_a_scan_beyond_the_limits_is_refused_with_the_limit(what, capsys, nominal, tmp_path):
     limits = tmp_path / "limits.yaml"

@@ -118,7 +118,7 @@ SOURCES = {
 LIMITS = {
     "servo_frequency": 50.0, "probe_range": 1e-4, "spindle_speed_rpm": 120.0,
     "motion_frequency": 50.0, "z_acceleration": 1.0, "z_jerk": 100.0, "point_spacing": 5e-5,
-    "exposure": 2e-4, "timing": 1e-6,
+    "exposure": 2e-4, "timing": 1e-6, "x_beyond": 4e-3,
 }  # fmt: skip
 GEOMETRY = {"centre_x": 1e-6, "centre_y": 1e-6, "beam_x": 1e-3, "abbe_arm": 0.05}
 COLUMNS = {

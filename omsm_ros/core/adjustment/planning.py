@@ -150,15 +150,12 @@ def posterior_uncertainty(
     solution = solve(Network(blocks, families, part), np.zeros(len(blocks)), scales, sizes)
     made = FormOf.of(completed(solution), nominal, removed)
     pv, height = _of_pv(made, form)
-    largest = None
-    if accuracy is not None:
-        made = replace(made, height=height)
-        largest = largest_contribution(made, effects_on_form(made), (), (), accuracy)
+    effects = {} if accuracy is None else effects_on_form(made)
     return PlannedUncertainty(
         pv=pv,
         sources={f.name: solution.uncertainty(f.name) for f in families if f.name in sizes},
         duration=begin - _PAUSE_S,
-        largest=largest,
+        largest=largest_contribution(replace(made, height=height), effects, (), (), accuracy),
     )
 
 

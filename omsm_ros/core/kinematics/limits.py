@@ -49,6 +49,7 @@ class MachineLimits(CheckedRecord):
         holds below 120;  motion_frequency: highest content of the Z motion [Hz], the paper's 50
     z_acceleration: [m/s²];  z_jerk: [m/s³];  point_spacing: along the path [m]
     exposure: of one reading [s];  timing: standard uncertainty of a trigger [s]
+    x_beyond: travel of X on the other side of the spindle axis [m], for planned scans alone
     """
 
     servo_frequency: float | None = _FREQUENCY.of_field(50.0)
@@ -60,6 +61,7 @@ class MachineLimits(CheckedRecord):
     point_spacing: float | None = _LENGTH.of_field(None)
     exposure: float | None = _TIME.of_field(None)
     timing: float | None = _TIME.of_field(None)
+    x_beyond: float | None = Quantity("limit", "m", 0.0, 1.0, "give it in metres").of_field(None)
 
 
 @dataclass(frozen=True, slots=True)
