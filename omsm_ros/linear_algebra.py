@@ -49,12 +49,17 @@ def orthonormal(columns: FloatArray, tolerance: float) -> FloatArray:
 
 def inverse_gram(gram: FloatArray) -> FloatArray:
     """Return the pseudoinverse of products of columns (q, q), without what is rounding."""
+    root = inverse_root(gram)
+    return np.asarray(root @ root.T)
+
+
+def inverse_root(gram: FloatArray) -> FloatArray:
+    """Return R (q, r) with R Rᵀ the pseudoinverse of products of columns (q, q)."""
     scale = np.sqrt(np.maximum(np.diag(gram), 0.0))  # rounding may leave less than nothing
     scale[scale == 0] = 1.0
     values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
-    kept = values > ROUNDING * values[-1]
-    root = directions[:, kept] / np.sqrt(values[kept]) / scale[:, np.newaxis]
-    return np.asarray(root @ root.T)
+    kept = values > ROUNDING * np.max(values, initial=0.0)
+    return np.asarray(directions[:, kept] / np.sqrt(values[kept]) / scale[:, np.newaxis])
 
 
 class _OneThread(ContextDecorator):

@@ -17,12 +17,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import polynomial
-from scipy import fft, signal
+from scipy import fft
 
 from omsm_ros.core.kinematics.trajectories import s_curve
 from omsm_ros.core.lti.frequency_response import Band
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.linear_algebra import sosfilt
 
 BAND_LIMITED, ZERO_ORDER, FIRST_ORDER = "band-limited", "zero-order", "first-order"
 HOLDS = (BAND_LIMITED, ZERO_ORDER, FIRST_ORDER)
@@ -140,8 +141,8 @@ class ParallelSections:
         late = int(np.ceil(np.max(self.delays, initial=0.0) / self.period - 1e-6))
         pulses = np.eye(min(late + (self.hold != BAND_LIMITED), samples), samples)
         down = [recursion(d1, d2, self.hold, self.period) for d1, d2 in self.denominators]
-        rows = [row for each in down for row in decays_of(each, samples, late=late)]
-        return np.asarray(np.concatenate([np.reshape(rows, (-1, samples)), pulses]))
+        rows = orthogonal_decays(down, max(samples - late, 1))
+        return np.concatenate([np.pad(rows, ((0, 0), (samples - rows.shape[1], 0))), pulses])
 
     def equivalent(self) -> ParallelSections | None:
         """Return G(s) of which this is the sampled form; None where there is no such G.
@@ -258,12 +259,30 @@ def _roots(d1: float, d2: float) -> ComplexArray:
     return np.array([far, 1 / (d2 * far)])
 
 
-def decays_of(down: FloatArray, samples: int, late: int = 0) -> list[FloatArray]:
-    """Return the free responses (samples,) of one recursion, from sample ``late`` on."""
+def orthogonal_decays(downs: list[FloatArray], samples: int) -> FloatArray:
+    """Return functions (states, samples) that span the free responses of all recursions ``downs``.
+
+    Those of Takenaka and Malmquist (Ninness and Gustafsson 1997): each section is driven by the
+    all-passes of those before. They are orthogonal over an endless record, so their products are
+    well conditioned, where those of the decays of neighbouring poles are not.
+    """
+    rows, place = np.zeros((sum(len(down) - 1 for down in downs), samples)), 0
     pulse = np.zeros(samples)
-    pulse[min(late, samples - 1)] = 1.0
-    first = np.asarray(signal.lfilter([1.0], down, pulse))
-    return [first, np.concatenate([[0.0], first[:-1]])][: len(down) - 1]
+    pulse[:1] = 1.0
+    for down in downs:
+        now = sosfilt(np.array([[1.0, 0.0, 0.0, *down, 0.0][:6]]), pulse, np.zeros((1, 2)))
+        rows[place] = now
+        # The all-pass of the section has its denominator in the reverse order above it.
+        pulse = down[-1] * now
+        for late, factor in enumerate(down[-2::-1], 1):
+            pulse[late:] += factor * now[:-late]
+        if len(down) == 3:
+            # Sum and difference of neighbours are orthogonal, too.
+            rows[place + 1] = now
+            rows[place, 1:] += now[:-1]
+            rows[place + 1, 1:] -= now[:-1]
+        place += len(down) - 1
+    return rows
 
 
 def _polynomial_of(poles: ComplexArray) -> list[float]:

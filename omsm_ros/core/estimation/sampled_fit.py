@@ -26,13 +26,13 @@ from omsm_ros.core.estimation.parallel_sections import (
     BAND_LIMITED,
     ParallelSections,
     closed_inputs,
-    decays_of,
+    orthogonal_decays,
     recursion,
     variable,
 )
 from omsm_ros.core.lti.transfer_function import ComplexArray, Structure
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
-from omsm_ros.linear_algebra import ROUNDING, inverse_gram
+from omsm_ros.linear_algebra import ROUNDING, inverse_gram, inverse_root
 
 # Unit of w inside a fit, in 1/T: the middle of the range of sampled poles.
 RATE = 0.5
@@ -67,6 +67,41 @@ class SampledRecord:
     def part(self, part: slice) -> SampledRecord:
         """Return the samples of ``part``."""
         return SampledRecord(self.inputs[part], self.output[part], self.used[part])
+
+
+@dataclass(frozen=True, eq=False)
+class _FreeResponses:
+    """Responses to initial states, ``rows`` (q, e) at the first compared places, and an offset.
+
+    root: (q, r), with which they have products of one, orthogonal to the offset
+    mean: of each row over all compared places, (q,)
+    """
+
+    rows: FloatArray
+    root: FloatArray
+    mean: FloatArray
+
+    def along(self, values: FloatArray) -> FloatArray:
+        """Return the coordinates (…, r) of ``values`` (…, places) without mean along them."""
+        return np.asarray((values[..., : self.rows.shape[1]] @ self.rows.T) @ self.root)
+
+    def removed(self, values: FloatArray) -> FloatArray:
+        """Make ``values`` (places,) without mean orthogonal to them; return the same array."""
+        self.add(-self.along(values), values)
+        return values
+
+    def add(self, along: FloatArray, values: FloatArray) -> None:
+        """Add what has the coordinates ``along`` (…, r) to ``values`` (…, places)."""
+        size = along @ self.root.T
+        values[..., : self.rows.shape[1]] += size @ self.rows
+        values -= (size @ self.mean)[..., np.newaxis]
+
+    def basis(self, places: int) -> FloatArray:
+        """Return an orthonormal basis (r + 1, places) of all, that of the offset last."""
+        found = np.full((self.root.shape[1] + 1, places), 1 / np.sqrt(places))
+        found[:-1] = -(self.root.T @ self.mean)[:, np.newaxis]
+        found[:-1, : self.rows.shape[1]] += self.root.T @ self.rows
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,29 +142,22 @@ class _Spectra:
 
     def in_time(self, spectra: ComplexArray) -> FloatArray:
         """Return ``spectra`` (…, k) at the compared samples, (…, places)."""
-        first, last = self.places[[0, -1]]
-        kept = slice(first, last + 1) if last - first < len(self.places) else self.places
-        return np.asarray(fft.irfft(spectra, self.length, axis=-1)[..., kept])
+        return np.asarray(fft.irfft(spectra, self.length)[..., _without_copy(self.places)])
 
-    def driven(self, drives: ComplexArray, basis: ComplexArray) -> FloatArray:
-        """Return each of ``basis`` (b, k) times each of ``drives`` (m, k) in time, (mb, places)."""
-        return self.in_time((drives[:, np.newaxis] * basis).reshape(-1, len(self.w)))
-
-    def free(self, sections: FloatArray) -> FloatArray:
-        """Return an orthonormal basis (places, states + 1) of initial states and offset."""
-        # Where even the slowest state has decayed to rounding, e^-36, all places are one row.
+    def free(self, sections: FloatArray) -> _FreeResponses:
+        """Return the responses to initial states and the offset."""
         downs = [recursion(d1 / RATE, d2 / RATE**2, self.hold, 1.0) for d1, d2 in sections]
         first, last = np.array([(*down[1:], 0.0)[:2] for down in downs]).reshape(-1, 2).T
         apart = np.sqrt(first**2 / 4 - last + 0j)
         slowest = np.max(np.abs([apart - first / 2, apart + first / 2]), initial=0.0)
-        lasting = min(int(-36 / np.log(np.clip(slowest, 1e-9, 1 - 1e-9))) + 2, len(self.record))
-        early = self.places[self.places < lasting]
-        late = len(self.places) - len(early)
-        rows = [np.ones(lasting), *(row for down in downs for row in decays_of(down, lasting))]
-        columns = np.pad(np.array(rows)[:, early].T, ((0, 1), (0, 0)))
-        columns[-1, 0] = np.sqrt(late)
-        basis = linalg.qr(columns, mode="economic")[0]
-        return np.concatenate([basis[:-1], np.tile(basis[-1:] / np.sqrt(max(late, 1)), (late, 1))])
+        # Until even the slowest has decayed to rounding, e^-36; each can delay it by two decays.
+        decays = (36 + 2 * np.count_nonzero(sections)) / -np.log(np.clip(slowest, 1e-9, 1 - 1e-9))
+        rows = orthogonal_decays(downs, min(int(decays) + 2, len(self.record)))
+        early = self.places[self.places < rows.shape[1]]
+        rows, count = rows[:, _without_copy(early)], len(self.places)
+        mean = np.sum(rows, axis=1) / count
+        root = inverse_root(rows @ rows.T - count * np.outer(mean, mean))
+        return _FreeResponses(rows, root, mean)
 
     @cached_property
     def excited(self) -> tuple[FloatArray, ComplexArray, ComplexArray]:
@@ -233,60 +261,39 @@ class SectionsProblem:
             np.concatenate([ends[1], np.full(count, longest)]),
         )
 
-    def _inputs(
-        self, one: _Spectra, nonlinear: FloatArray, order: int
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Return the delayed inputs of a record (m, k), and the basis (1 + n, k)."""
-        late = self.late(nonlinear, order)[:, np.newaxis]
-        drives = one.inputs * np.exp(-1j * one.angle * late) if np.any(late) else one.inputs
-        return drives, basis_of(sections_of(nonlinear, order), one.w)
+    def _columns(self, nonlinear: FloatArray, order: int) -> list[_Columns]:
+        return [_Columns(self, one, nonlinear, order) for one in self.spectra]
 
     def project(self, nonlinear: FloatArray, order: int) -> Projection:
         """Return the residual after the linear parameters are eliminated."""
-        sections = sections_of(nonlinear, order)
-        targets, frees = [], []
-        ends = np.cumsum([len(one.places) for one in self.spectra])
-        every = np.empty((self.inputs * (1 + order), ends[-1]))
-        for one, columns in zip(self.spectra, np.split(every, ends[:-1], axis=1), strict=True):
-            free = one.free(sections)
-            columns[:] = one.driven(*self._inputs(one, nonlinear, order))
-            columns -= (columns @ free) @ free.T
-            targets.append(one.output - free @ (free.T @ one.output))
-            frees.append(free)
-        target = np.concatenate(targets)
-        inverse = inverse_gram(every @ every.T)
-        linear = inverse @ (every @ target)
+        parts = self._columns(nonlinear, order)
+        grams = [part.rows @ part.rows.T - part.along @ part.along.T for part in parts]
+        inverse = inverse_gram(np.sum(grams, axis=0))
+        left = [part.free.removed(part.one.output.copy()) for part in parts]
+        linear = np.zeros(len(inverse))
         # Refined once, because the inverse has the squared condition of the columns.
-        linear += inverse @ (every @ (target - linear @ every))
+        for _ in range(2):
+            pairs = list(zip(parts, left, strict=True))
+            change = inverse @ np.sum([part.rows @ rest for part, rest in pairs], axis=0)
+            left = [part.free.removed(rest - change @ part.rows) for part, rest in pairs]
+            linear += change
         found = linear.reshape(self.inputs, -1)
 
-        residual = target - linear @ every
-
         def normal() -> tuple[FloatArray, FloatArray]:
-            parts = zip(self.spectra, frees, strict=True)
-            slopes = [self._slopes(*part, nonlinear, order, found) for part in parts]
-            every_slope = np.concatenate(slopes, axis=1)
-            free = (every_slope @ every.T) @ inverse @ every - every_slope
-            return free @ residual, free @ free.T
+            each = [(part, part.slopes(found)) for part in parts]
+            own = [part.free.along(slopes) for part, slopes in each]
+            mixed = [
+                slopes @ part.rows.T - along @ part.along.T
+                for (part, slopes), along in zip(each, own, strict=True)
+            ]
+            share = np.sum(mixed, axis=0) @ inverse
+            slope = -np.sum([s @ rest for (_, s), rest in zip(each, left, strict=True)], axis=0)
+            for (part, slopes), along in zip(each, own, strict=True):
+                slopes -= share @ part.rows
+                part.free.add(share @ part.along - along, slopes)
+            return slope, np.sum([slopes @ slopes.T for _, slopes in each], axis=0)
 
-        return Projection(nonlinear, residual, np.ravel(found), normal)
-
-    def _slopes(
-        self, one: _Spectra, free: FloatArray, nonlinear: FloatArray, order: int, linear: FloatArray
-    ) -> FloatArray:
-        """Return d output / d nonlinear of a record (p, places), orthogonal to ``free``."""
-        drives, basis = self._inputs(one, nonlinear, order)
-        sections, terms = sections_of(nonlinear, order), (linear[:, 1:].T @ drives) * basis[1:]
-        firsts = np.cumsum([0, *(1 + (sections[:, 1] > 0))])[:-1]
-        parts = np.add.reduceat(terms, firsts, axis=0) if len(sections) else terms
-        d1, d2 = sections.T[:, :, np.newaxis]
-        parts = parts * one.w / (1 + d1 * one.w + d2 * one.w**2)
-        second = sections[:, 1] > 0
-        rows = [-d1 * parts, -d2[second] * parts[second] * one.w]
-        if self.hold == BAND_LIMITED:
-            rows.append(-1j * one.angle / RATE * (linear @ basis) * drives)
-        found = one.in_time(np.concatenate(rows))
-        return np.asarray(found - (found @ free) @ free.T)
+        return Projection(nonlinear, np.concatenate(left), linear, normal)
 
     def fit(self, order: int, starts: Sequence[FloatArray], evaluations: int = 40) -> SectionsFit:
         """Improve each of ``starts`` by a few iterations; return the minimum of the best."""
@@ -338,11 +345,11 @@ class SectionsProblem:
         """
         order, size = fitted.order, fitted.linear.size
         gram = np.zeros((size + len(fitted.nonlinear), size + len(fitted.nonlinear)))
-        columns, frees = [], [one.free(fitted.sections) for one in self.spectra]
-        for one, free in zip(self.spectra, frees, strict=True):
-            rows = one.driven(*self._inputs(one, fitted.nonlinear, order))
-            slopes = self._slopes(one, free, fitted.nonlinear, order, fitted.linear)
-            columns.append(np.concatenate([rows - (rows @ free) @ free.T, slopes]))
+        columns, frees = [], []
+        for part in self._columns(fitted.nonlinear, order):
+            frees.append(part.free.basis(len(part.one.places)))
+            rows = np.concatenate([part.rows, part.slopes(fitted.linear)])
+            columns.append(rows - (rows @ frees[-1].T) @ frees[-1])
             gram += columns[-1] @ columns[-1].T
         scale = np.sqrt(np.maximum(np.diag(gram), 0.0))  # rounding may leave less than nothing
         scale[scale == 0] = 1.0
@@ -357,7 +364,7 @@ class SectionsProblem:
             start += len(one.places)
             length = fft.next_fast_len(len(one.record) + 64, real=True)
             length += length % 2
-            leverage = leverage_of(np.concatenate([basis, free.T]), length)
+            leverage = leverage_of(np.concatenate([basis, free]), length)
             on_grid = np.zeros((len(basis), len(one.record)))
             on_grid[:, one.places] = basis
             score += weighted_gram(on_grid, length, noise_spectrum(residual, length, leverage))
@@ -382,6 +389,77 @@ class SectionsProblem:
         return turn
 
 
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """The linear columns of one record at one ψ, and their derivatives, all without means."""
+
+    problem: SectionsProblem
+    one: _Spectra
+    nonlinear: FloatArray
+    order: int
+
+    @cached_property
+    def _sections(self) -> FloatArray:
+        return sections_of(self.nonlinear, self.order)
+
+    @cached_property
+    def drives(self) -> ComplexArray:
+        """The delayed inputs, (m, k)."""
+        late = self.problem.late(self.nonlinear, self.order)[:, np.newaxis]
+        one = self.one
+        return one.inputs * np.exp(-1j * one.angle * late) if np.any(late) else one.inputs
+
+    @cached_property
+    def _basis(self) -> ComplexArray:
+        return basis_of(self._sections, self.one.w)
+
+    @cached_property
+    def free(self) -> _FreeResponses:
+        """The responses to the initial states and the offset."""
+        return self.one.free(self._sections)
+
+    @cached_property
+    def rows(self) -> FloatArray:
+        """The driven columns, (m + mn, places)."""
+        driven = self.drives[:, np.newaxis] * self._basis
+        return _centred(self.one.in_time(driven.reshape(-1, len(self.one.w))))
+
+    @cached_property
+    def along(self) -> FloatArray:
+        """Their coordinates along the free responses."""
+        return self.free.along(self.rows)
+
+    def slopes(self, linear: FloatArray) -> FloatArray:
+        """Return d output / d nonlinear (p, places) at the ``linear`` parameters (m, 1 + n)."""
+        one, sections, basis = self.one, self._sections, self._basis
+        count, place = len(sections), 1
+        found = np.empty((len(self.nonlinear), len(one.w)), np.complex128)
+        # One section at a time, because its rows stay in the cache.
+        for i, (d1, d2) in enumerate(sections):
+            part = linear[:, place] @ self.drives
+            if d2 > 0:
+                part += one.w * (linear[:, place + 1] @ self.drives)
+            part *= basis[place] * basis[place] * one.w
+            np.multiply(-d1, part, out=found[i])
+            if d2 > 0:
+                np.multiply(-d2 * one.w, part, out=found[count + i])
+            place += 1 + (d2 > 0)
+        if self.problem.hold == BAND_LIMITED:
+            found[self.order :] = -1j * one.angle / RATE * (linear @ basis) * self.drives
+        return _centred(one.in_time(found))
+
+
+def _without_copy(places: IntArray) -> slice | IntArray:
+    """Return ``places`` as a slice where none between them is missing."""
+    whole = len(places) > 0 and places[-1] - places[0] < len(places)
+    return slice(int(places[0]), int(places[-1]) + 1) if whole else places
+
+
+def _centred(rows: FloatArray) -> FloatArray:
+    rows -= np.mean(rows, axis=1, keepdims=True)
+    return rows
+
+
 def _numerator_places(sections: FloatArray) -> BoolArray:
     """Return which of b0 and b1 each section has, (k, 2): a single pole has no b1."""
     return np.column_stack([np.full(len(sections), True), sections[:, 1] > 0])
@@ -402,11 +480,14 @@ def basis_of(sections: FloatArray, w: ComplexArray) -> ComplexArray:
 
     There is no w/S of a single pole.
     """
-    rows = [np.ones_like(w)]
+    found, place = np.empty((1 + int(np.count_nonzero(sections)), len(w)), np.complex128), 1
+    found[0] = 1.0
     for d1, d2 in sections:
-        rows.append(1 / (1 + d1 * w + d2 * w * w))
-        rows += [w * rows[-1]] if d2 > 0 else []
-    return np.asarray(np.reshape(rows, (-1, len(w))), np.complex128)
+        np.divide(1.0, 1.0 + w * (d1 + d2 * w), out=found[place])
+        if d2 > 0:
+            np.multiply(w, found[place], out=found[place + 1])
+        place += 1 + (d2 > 0)
+    return found
 
 
 def grown_starts(problem: SectionsProblem, smaller: SectionsFit, order: int) -> list[ComplexArray]:
@@ -434,7 +515,7 @@ def _missing_pairs(problem: SectionsProblem, fitted: SectionsFit, count: int) ->
     spectrum = np.asarray(fft.rfft(grid, one.length), np.complex128)
     power, shown = ndimage.uniform_filter1d(np.abs(spectrum) ** 2, 15), one.excited[0][[0, -1]]
     power[(one.angle < shown[0]) | (one.angle > shown[1])] = 0.0
-    drives = problem._inputs(one, fitted.nonlinear, fitted.order)[0][:, np.newaxis]
+    drives = _Columns(problem, one, fitted.nonlinear, fitted.order).drives[:, np.newaxis]
     peaks, tried = signal.find_peaks(power, distance=10)[0], []
     for line in peaks[np.argsort(power[peaks])[::-1][:_TRIED_LINES]] if count else ():
         rate = abs(one.w[line])

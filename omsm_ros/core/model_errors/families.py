@@ -97,10 +97,17 @@ def dahl_friction(motion: FloatArray, travel: float) -> tuple[FloatArray, FloatA
     begun = np.append(motion[:1], motion[turns[:-1]])
     ways = np.sign(motion[turns] - begun)
     kept = np.exp(-np.abs(motion[turns] - begun) / travel)
-    value, values = 0.0, []
-    for way, part in zip(ways.tolist(), kept.tolist(), strict=True):
-        values.append(value)
-        value = way + (value - way) * part
+    # Each part moves the force to kept · force + its end: those of each block are combined.
+    size = int(np.sqrt(len(turns))) + 1
+    shape = -(-len(turns) // size), size
+    ends, kept = np.resize(ways * (1 - kept), shape), np.resize(kept, shape)
+    for k in range(1, size):
+        ends[:, k] += kept[:, k] * ends[:, k - 1]
+        kept[:, k] *= kept[:, k - 1]
+    value, before = 0.0, np.zeros((len(ends), 1))
+    for row in range(1, len(ends)):
+        before[row] = value = float(ends[row - 1, -1] + kept[row - 1, -1] * value)
+    values = np.append(0.0, (ends + kept * before).ravel()[: len(turns) - 1])
     lengths = np.diff(turns, prepend=-1)
     begun, ways, first = (np.repeat(each, lengths) for each in (begun, ways, values))
     force = ways + (first - ways) * np.exp(-np.abs(motion - begun) / travel)
