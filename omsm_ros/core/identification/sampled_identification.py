@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage, special
+from scipy import ndimage, signal, special
 
 from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.core.estimation.impulse_response import impulse_response
@@ -53,6 +53,9 @@ _FREQUENCIES = 400
 _LINES, _LINES_PER_INPUT, _BLOCK_RATIO = 12, 8, 1.5
 # Power of a line over the largest nearby, and over the largest of all, below which it is left out.
 _NEARBY, _LEAST_POWER = 1e-3, 1e-8
+# Part of a record that is tapered, and the least share of the power of neighbouring lines that
+# remains where they are excited.
+_TAPER, _LEAKED = 0.2, 0.1
 # Singular value of unit columns below which inputs are not distinguished.
 _COLLINEAR = 1e-3
 # Power of a line over the largest of its block from which it counts for the range of the block.
@@ -206,6 +209,11 @@ def _blocks(candidate: SampledCandidate, period: float) -> list[_Block]:
         power = np.sum(powers, axis=0)
         nearby = ndimage.maximum_filter1d(power, _LINES)
         excited = (power > _NEARBY * nearby) & (power > _LEAST_POWER * power.max())
+        # What a taper removes is leakage of other lines from the ends of the record.
+        taper = signal.windows.tukey(len(record), _TAPER)
+        kept = np.sum(np.abs(np.fft.rfft(centred * taper[:, np.newaxis], axis=0)) ** 2, axis=1)
+        kept, whole = (ndimage.uniform_filter1d(each, _LINES) for each in (kept, power))
+        excited &= kept > _LEAKED * whole
         powers *= excited
         # Lines near an excited one show the noise.
         lines = np.flatnonzero(ndimage.binary_dilation(excited, iterations=_LINES // 2))

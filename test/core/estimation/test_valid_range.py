@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from sections_of_polynomials import from_polynomials
 
-from omsm_ros.core.identification.sampled_identification import valid_range
+from omsm_ros.core.estimation.sampled_fit import SampledRecord
+from omsm_ros.core.identification.sampled_identification import identify_samples, valid_range
 
 LINES = np.geomspace(0.05, 10, 400)
 
@@ -81,3 +82,18 @@ def test_the_range_ends_with_the_lines_of_the_input():
     low, high = valid_range(known(1e-10), [block(0.4, 0.6, 0.0)], LINES, 0, np.zeros((0, 400)))
     assert 0.4 <= low < 0.42
     assert 0.58 < high <= 0.6
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_no_range_goes_beyond_the_excitation_where_the_ends_of_a_record_leak(seed):
+    """The motion has nothing above 0.3 of the sampling rate, the machine a mode at 0.38."""
+    rng, lines = np.random.default_rng(seed), np.fft.rfftfreq(8192)
+    modes = [(1.0, 0.08), (0.5, 0.17), (0.3, 0.38)]
+    truth = sum(a / (1 + 0.04j * lines / f - (lines / f) ** 2) for a, f in modes)
+    spectrum = np.fft.rfft(rng.normal(size=8192)) * (lines < 0.3)
+    motion, output = (np.fft.irfft(each)[:1200] for each in (spectrum, spectrum * truth))
+    output += 1e-3 * np.std(output) * rng.normal(size=1200)
+    record = SampledRecord(motion[:, np.newaxis], output, np.ones(1200, bool))
+    model = identify_samples([record], 1.0, hold="band-limited", order=6)
+    assert model.certificate["verdict"].startswith("accepted")
+    assert 0.25 < model.valid[0][1] < 0.31
