@@ -53,13 +53,24 @@ def inverse_gram(gram: FloatArray) -> FloatArray:
     return np.asarray(root @ root.T)
 
 
-def inverse_root(gram: FloatArray) -> FloatArray:
-    """Return R (q, r) with R Rᵀ the pseudoinverse of products of columns (q, q)."""
+def inverse_root(gram: FloatArray, *, keep: bool = False) -> FloatArray:
+    """Return R (q, r) with R Rᵀ the pseudoinverse of products of columns (q, q).
+
+    keep: directions lost in rounding count as the weakest that is not, instead of being left out
+    """
     scale = np.sqrt(np.maximum(np.diag(gram), 0.0))  # rounding may leave less than nothing
     scale[scale == 0] = 1.0
     values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
-    kept = values > ROUNDING * np.max(values, initial=0.0)
-    return np.asarray(directions[:, kept] / np.sqrt(values[kept]) / scale[:, np.newaxis])
+    least = ROUNDING * np.max(values, initial=0.0)
+    kept = (values > least) | keep
+    values = np.maximum(values[kept], least)
+    return np.asarray(directions[:, kept] / np.sqrt(values) / scale[:, np.newaxis])
+
+
+def without_copy(places: NDArray[np.int64]) -> slice | NDArray[np.int64]:
+    """Return rising ``places`` (k,) as a slice where none between them is missing."""
+    whole = len(places) > 0 and places[-1] - places[0] < len(places)
+    return slice(int(places[0]), int(places[-1]) + 1) if whole else places
 
 
 class _OneThread(ContextDecorator):

@@ -24,7 +24,7 @@ from omsm_ros.core.estimation.optimisation import Projection
 from omsm_ros.core.estimation.parallel_sections import close_period
 from omsm_ros.core.lti.transfer_function import ComplexArray, Structure
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
-from omsm_ros.linear_algebra import BLOCK_VALUES, inverse_gram, least_squares
+from omsm_ros.linear_algebra import BLOCK_VALUES, inverse_gram, least_squares, without_copy
 
 # Lines over which power is averaged: it is then known to 10 %.
 _SMOOTHING_BINS = 101
@@ -207,9 +207,7 @@ class Problem:
     @cached_property
     def kept(self) -> slice | IntArray:
         """Places of the compared samples, without a copy where no sample between them is lost."""
-        places = np.flatnonzero(self.used)
-        whole = len(places) > 0 and places[-1] - places[0] < len(places)
-        return slice(int(places[0]), int(places[-1]) + 1) if whole else places
+        return without_copy(np.flatnonzero(self.used))
 
     @cached_property
     def _fixed(self) -> FloatArray:

@@ -32,7 +32,7 @@ from omsm_ros.core.estimation.parallel_sections import (
 )
 from omsm_ros.core.lti.transfer_function import ComplexArray, Structure
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
-from omsm_ros.linear_algebra import ROUNDING, inverse_gram, inverse_root
+from omsm_ros.linear_algebra import inverse_gram, inverse_root, without_copy
 
 # Unit of w inside a fit, in 1/T: the middle of the range of sampled poles.
 RATE = 0.5
@@ -67,41 +67,6 @@ class SampledRecord:
     def part(self, part: slice) -> SampledRecord:
         """Return the samples of ``part``."""
         return SampledRecord(self.inputs[part], self.output[part], self.used[part])
-
-
-@dataclass(frozen=True, eq=False)
-class _FreeResponses:
-    """Responses to initial states, ``rows`` (q, e) at the first compared places, and an offset.
-
-    root: (q, r), with which they have products of one, orthogonal to the offset
-    mean: of each row over all compared places, (q,)
-    """
-
-    rows: FloatArray
-    root: FloatArray
-    mean: FloatArray
-
-    def along(self, values: FloatArray) -> FloatArray:
-        """Return the coordinates (…, r) of ``values`` (…, places) without mean along them."""
-        return np.asarray((values[..., : self.rows.shape[1]] @ self.rows.T) @ self.root)
-
-    def removed(self, values: FloatArray) -> FloatArray:
-        """Make ``values`` (places,) without mean orthogonal to them; return the same array."""
-        self.add(-self.along(values), values)
-        return values
-
-    def add(self, along: FloatArray, values: FloatArray) -> None:
-        """Add what has the coordinates ``along`` (…, r) to ``values`` (…, places)."""
-        size = along @ self.root.T
-        values[..., : self.rows.shape[1]] += size @ self.rows
-        values -= (size @ self.mean)[..., np.newaxis]
-
-    def basis(self, places: int) -> FloatArray:
-        """Return an orthonormal basis (r + 1, places) of all, that of the offset last."""
-        found = np.full((self.root.shape[1] + 1, places), 1 / np.sqrt(places))
-        found[:-1] = -(self.root.T @ self.mean)[:, np.newaxis]
-        found[:-1, : self.rows.shape[1]] += self.root.T @ self.rows
-        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,23 +106,10 @@ class _Spectra:
         return variable(self.hold, self.angle / (2 * np.pi)) / RATE
 
     def in_time(self, spectra: ComplexArray) -> FloatArray:
-        """Return ``spectra`` (…, k) at the compared samples, (…, places)."""
-        return np.asarray(fft.irfft(spectra, self.length)[..., _without_copy(self.places)])
-
-    def free(self, sections: FloatArray) -> _FreeResponses:
-        """Return the responses to initial states and the offset."""
-        downs = [recursion(d1 / RATE, d2 / RATE**2, self.hold, 1.0) for d1, d2 in sections]
-        first, last = np.array([(*down[1:], 0.0)[:2] for down in downs]).reshape(-1, 2).T
-        apart = np.sqrt(first**2 / 4 - last + 0j)
-        slowest = np.max(np.abs([apart - first / 2, apart + first / 2]), initial=0.0)
-        # Until even the slowest has decayed to rounding, e^-36; each can delay it by two decays.
-        decays = (36 + 2 * np.count_nonzero(sections)) / -np.log(np.clip(slowest, 1e-9, 1 - 1e-9))
-        rows = orthogonal_decays(downs, min(int(decays) + 2, len(self.record)))
-        early = self.places[self.places < rows.shape[1]]
-        rows, count = rows[:, _without_copy(early)], len(self.places)
-        mean = np.sum(rows, axis=1) / count
-        root = inverse_root(rows @ rows.T - count * np.outer(mean, mean))
-        return _FreeResponses(rows, root, mean)
+        """Return ``spectra`` (…, k) at the compared samples, without means, (…, places)."""
+        found = np.asarray(fft.irfft(spectra, self.length)[..., without_copy(self.places)])
+        found -= np.mean(found, axis=-1, keepdims=True)
+        return found
 
     @cached_property
     def excited(self) -> tuple[FloatArray, ComplexArray, ComplexArray]:
@@ -269,19 +221,19 @@ class SectionsProblem:
         parts = self._columns(nonlinear, order)
         grams = [part.rows @ part.rows.T - part.along @ part.along.T for part in parts]
         inverse = inverse_gram(np.sum(grams, axis=0))
-        left = [part.free.removed(part.one.output.copy()) for part in parts]
+        left = [part.without_free(part.one.output.copy()) for part in parts]
         linear = np.zeros(len(inverse))
         # Refined once, because the inverse has the squared condition of the columns.
         for _ in range(2):
             pairs = list(zip(parts, left, strict=True))
             change = inverse @ np.sum([part.rows @ rest for part, rest in pairs], axis=0)
-            left = [part.free.removed(rest - change @ part.rows) for part, rest in pairs]
+            left = [part.without_free(rest - change @ part.rows) for part, rest in pairs]
             linear += change
         found = linear.reshape(self.inputs, -1)
 
         def normal() -> tuple[FloatArray, FloatArray]:
             each = [(part, part.slopes(found)) for part in parts]
-            own = [part.free.along(slopes) for part, slopes in each]
+            own = [part.along_free(slopes) for part, slopes in each]
             mixed = [
                 slopes @ part.rows.T - along @ part.along.T
                 for (part, slopes), along in zip(each, own, strict=True)
@@ -290,7 +242,7 @@ class SectionsProblem:
             slope = -np.sum([s @ rest for (_, s), rest in zip(each, left, strict=True)], axis=0)
             for (part, slopes), along in zip(each, own, strict=True):
                 slopes -= share @ part.rows
-                part.free.add(share @ part.along - along, slopes)
+                part.add_free(share @ part.along - along, slopes)
             return slope, np.sum([slopes @ slopes.T for _, slopes in each], axis=0)
 
         return Projection(nonlinear, np.concatenate(left), linear, normal)
@@ -343,28 +295,21 @@ class SectionsProblem:
         It is the sandwich of the least squares in coloured noise, with the autocovariance of the
         residual of each record.
         """
-        order, size = fitted.order, fitted.linear.size
-        gram = np.zeros((size + len(fitted.nonlinear), size + len(fitted.nonlinear)))
-        columns, frees = [], []
-        for part in self._columns(fitted.nonlinear, order):
-            frees.append(part.free.basis(len(part.one.places)))
-            rows = np.concatenate([part.rows, part.slopes(fitted.linear)])
-            columns.append(rows - (rows @ frees[-1].T) @ frees[-1])
-            gram += columns[-1] @ columns[-1].T
-        scale = np.sqrt(np.maximum(np.diag(gram), 0.0))  # rounding may leave less than nothing
-        scale[scale == 0] = 1.0
-        values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
+        parts, start = self._columns(fitted.nonlinear, fitted.order), 0
+        columns = [
+            part.without_free(np.concatenate([part.rows, part.slopes(fitted.linear)]))
+            for part in parts
+        ]
+        gram = np.sum([each @ each.T for each in columns], axis=0)
         # A direction lost in rounding is as uncertain as the weakest.
-        values = np.maximum(values, ROUNDING * values[-1])
-        root = directions / np.sqrt(values) / scale[:, np.newaxis]
-        score, start = np.zeros_like(gram), 0
-        for one, free in zip(self.spectra, frees, strict=True):
-            basis = root.T @ columns.pop(0)
+        root, score = inverse_root(gram, keep=True), np.zeros_like(gram)
+        for part in parts:
+            one, basis = part.one, root.T @ columns.pop(0)
             residual = fitted.residual[start : start + len(one.places)]
             start += len(one.places)
             length = fft.next_fast_len(len(one.record) + 64, real=True)
             length += length % 2
-            leverage = leverage_of(np.concatenate([basis, free]), length)
+            leverage = leverage_of(np.concatenate([basis, part.free_basis()]), length)
             on_grid = np.zeros((len(basis), len(one.record)))
             on_grid[:, one.places] = basis
             score += weighted_gram(on_grid, length, noise_spectrum(residual, length, leverage))
@@ -391,7 +336,12 @@ class SectionsProblem:
 
 @dataclass(frozen=True, eq=False)
 class _Columns:
-    """The linear columns of one record at one ψ, and their derivatives, all without means."""
+    """The columns of one record at one ψ: driven ones, responses to initial states, an offset.
+
+    rows: the driven ones, without means, (m + mn, places)
+    free: responses to initial states at the first places, (q, e);  mean: over all places, (q,)
+    root: (q, r), with which they have products of one, orthogonal to the offset
+    """
 
     problem: SectionsProblem
     one: _Spectra
@@ -399,35 +349,70 @@ class _Columns:
     order: int
 
     @cached_property
-    def _sections(self) -> FloatArray:
-        return sections_of(self.nonlinear, self.order)
-
-    @cached_property
     def drives(self) -> ComplexArray:
         """The delayed inputs, (m, k)."""
-        late = self.problem.late(self.nonlinear, self.order)[:, np.newaxis]
-        one = self.one
+        late, one = self.problem.late(self.nonlinear, self.order)[:, np.newaxis], self.one
         return one.inputs * np.exp(-1j * one.angle * late) if np.any(late) else one.inputs
+
+    @cached_property
+    def _sections(self) -> FloatArray:
+        return sections_of(self.nonlinear, self.order)
 
     @cached_property
     def _basis(self) -> ComplexArray:
         return basis_of(self._sections, self.one.w)
 
     @cached_property
-    def free(self) -> _FreeResponses:
-        """The responses to the initial states and the offset."""
-        return self.one.free(self._sections)
+    def rows(self) -> FloatArray:
+        driven = self.drives[:, np.newaxis] * self._basis
+        return self.one.in_time(driven.reshape(-1, len(self.one.w)))
 
     @cached_property
-    def rows(self) -> FloatArray:
-        """The driven columns, (m + mn, places)."""
-        driven = self.drives[:, np.newaxis] * self._basis
-        return _centred(self.one.in_time(driven.reshape(-1, len(self.one.w))))
+    def free(self) -> FloatArray:
+        one, sections = self.one, self._sections
+        downs = [recursion(d1 / RATE, d2 / RATE**2, one.hold, 1.0) for d1, d2 in sections]
+        first, last = np.array([(*down[1:], 0.0)[:2] for down in downs]).reshape(-1, 2).T
+        apart = np.sqrt(first**2 / 4 - last + 0j)
+        slowest = np.max(np.abs([apart - first / 2, apart + first / 2]), initial=0.0)
+        # Until even the slowest has decayed to rounding, e^-36; each can delay it by two decays.
+        decays = (36 + 2 * self.order) / -np.log(np.clip(slowest, 1e-9, 1 - 1e-9))
+        rows = orthogonal_decays(downs, min(int(decays) + 2, len(one.record)))
+        return rows[:, without_copy(one.places[one.places < rows.shape[1]])]
+
+    @cached_property
+    def mean(self) -> FloatArray:
+        return np.asarray(np.sum(self.free, axis=1) / len(self.one.places))
+
+    @cached_property
+    def root(self) -> FloatArray:
+        offset = len(self.one.places) * np.outer(self.mean, self.mean)
+        return inverse_root(self.free @ self.free.T - offset)
 
     @cached_property
     def along(self) -> FloatArray:
-        """Their coordinates along the free responses."""
-        return self.free.along(self.rows)
+        """Coordinates (m + mn, r) of the driven columns along the free responses."""
+        return self.along_free(self.rows)
+
+    def along_free(self, values: FloatArray) -> FloatArray:
+        """Return the coordinates (…, r) of ``values`` (…, places) without mean."""
+        return np.asarray((values[..., : self.free.shape[1]] @ self.free.T) @ self.root)
+
+    def add_free(self, along: FloatArray, values: FloatArray) -> None:
+        """Add what has the coordinates ``along`` (…, r) to ``values`` (…, places)."""
+        size = along @ self.root.T
+        values[..., : self.free.shape[1]] += size @ self.free
+        values -= (size @ self.mean)[..., np.newaxis]
+
+    def without_free(self, values: FloatArray) -> FloatArray:
+        """Make ``values`` (…, places) without mean orthogonal to them; return the same array."""
+        self.add_free(-self.along_free(values), values)
+        return values
+
+    def free_basis(self) -> FloatArray:
+        """Return an orthonormal basis (r + 1, places) of the free responses and the offset."""
+        count, end = len(self.one.places), self.free.shape[1]
+        rows = np.pad(self.free, ((0, 1), (0, count - end))) - np.append(self.mean, -1)[:, None]
+        return np.asarray(linalg.block_diag(self.root, count**-0.5).T @ rows)
 
     def slopes(self, linear: FloatArray) -> FloatArray:
         """Return d output / d nonlinear (p, places) at the ``linear`` parameters (m, 1 + n)."""
@@ -444,20 +429,9 @@ class _Columns:
             if d2 > 0:
                 np.multiply(-d2 * one.w, part, out=found[count + i])
             place += 1 + (d2 > 0)
-        if self.problem.hold == BAND_LIMITED:
+        if one.hold == BAND_LIMITED:
             found[self.order :] = -1j * one.angle / RATE * (linear @ basis) * self.drives
-        return _centred(one.in_time(found))
-
-
-def _without_copy(places: IntArray) -> slice | IntArray:
-    """Return ``places`` as a slice where none between them is missing."""
-    whole = len(places) > 0 and places[-1] - places[0] < len(places)
-    return slice(int(places[0]), int(places[-1]) + 1) if whole else places
-
-
-def _centred(rows: FloatArray) -> FloatArray:
-    rows -= np.mean(rows, axis=1, keepdims=True)
-    return rows
+        return one.in_time(found)
 
 
 def _numerator_places(sections: FloatArray) -> BoolArray:
