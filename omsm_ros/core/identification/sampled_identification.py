@@ -203,7 +203,10 @@ def _blocks(candidate: SampledCandidate, period: float) -> list[_Block]:
         centred = record.inputs - np.mean(record.inputs, axis=0)
         spectra = np.asarray(np.fft.rfft(centred, axis=0).T, np.complex128)
         frequency = np.asarray(np.fft.rfftfreq(len(record)), np.float64)
-        driven = np.asarray(spectra * model.response(frequency))
+        # Zero where nothing is compared, as the residual is: lost samples do not agree.
+        answer = np.fft.irfft(spectra * model.response(frequency), len(record))
+        answer[:, np.setdiff1d(np.arange(len(record)), one.places)] = 0.0
+        driven = np.asarray(np.fft.rfft(answer), np.complex128)
         powers = np.abs(spectra) ** 2
         powers[:, 0] = 0.0
         power = np.sum(powers, axis=0)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import signal
 from sections_of_polynomials import from_polynomials
 
 from omsm_ros.core.estimation.sampled_fit import SampledRecord
@@ -97,3 +98,17 @@ def test_no_range_goes_beyond_the_excitation_where_the_ends_of_a_record_leak(see
     model = identify_samples([record], 1.0, hold="band-limited", order=6)
     assert model.certificate["verdict"].startswith("accepted")
     assert 0.25 < model.valid[0][1] < 0.31
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_samples_that_are_lost_together_support_no_range(seed):
+    """While they were lost, a sweep went from 0.12 to 0.17 of the sampling rate."""
+    rng, used = np.random.default_rng(seed), np.ones(3000, bool)
+    used[900:1300] = False
+    sweep = signal.chirp(np.arange(3000), 0.001, 3000, 0.4)
+    pair = np.poly(0.95 * np.exp(2j * np.pi * 0.15 * np.array([1, -1]))).real
+    output = signal.lfilter([0, 0.1], [1, -0.9], sweep) + signal.lfilter([0.3], pair, sweep)
+    output += 0.1 * np.std(output) * rng.normal(size=3000)
+    model = identify_samples([SampledRecord(sweep[:, np.newaxis], output, used)], 1.0)
+    assert model.certificate["verdict"].startswith("accepted")
+    assert model.valid[0][1] < 0.15
