@@ -75,10 +75,14 @@ def fast_mode(record: MotionRecord) -> FastMode:
     Raises StepTestError for a record without motion.
     """
     period, steps = record.sample_period, find_steps(record.z, record.sample_period)
+    # With readings of the probe on the level before it, and of the edge itself.
     whole = [
         edge
         for edge in steps.edges
-        if edge.start >= 40 and edge.start + 80 < len(record) and _is_read(record, edge)
+        if edge.start >= 40
+        and edge.start + 80 < len(record)
+        and np.mean(record.ok[edge.start + _LEVEL.start : edge.start + _LEVEL.stop]) > 0.5
+        and record.ok[edge.start : edge.stop].any()
     ]
     if len(whole) < _LEAST_EDGES:
         return FastMode(
@@ -94,12 +98,6 @@ def fast_mode(record: MotionRecord) -> FastMode:
     if gap > _LARGEST_GAP:
         return FastMode(finding=Notice("estimation.not_dithered", gap=gap))
     return _mode(edges, grid, command, edges.place - start[:, np.newaxis], period)
-
-
-def _is_read(record: MotionRecord, edge: Edge) -> bool:
-    """Return whether the probe has readings on the level before an edge, and of the edge."""
-    level = record.ok[edge.start + _LEVEL.start : edge.start + _LEVEL.stop]
-    return bool(np.mean(level) > 0.5 and record.ok[edge.start : edge.stop].any())
 
 
 def _normalised(record: MotionRecord, edges: list[Edge]) -> _Edges:

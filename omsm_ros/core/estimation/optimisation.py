@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.streams.blocks import FloatArray
 
 # Recommended for a fair start by Madsen, Nielsen and Tingleff (2004).
 _FIRST_DAMPING = 1e-3
@@ -101,7 +101,10 @@ def descend(project: Project, start: Projection, box: Box, evaluations: int) -> 
         free &= scale > _INSENSITIVE * np.max(scale)
         if not np.any(free):
             break
-        step = _damped_step(curvature, slope, scale, free, damping)
+        unit, step = scale[free], np.zeros_like(slope)
+        damped = curvature[np.ix_(free, free)] / np.outer(unit, unit) + damping * np.eye(len(unit))
+        step[free] = -np.linalg.solve(damped, slope[free] / unit) / unit
+        step = np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
         tried = project(np.clip(nonlinear + step, lower, upper))
         new_cost = float(tried.residual @ tried.residual)
         if not new_cost < cost:
@@ -117,13 +120,3 @@ def descend(project: Project, start: Projection, box: Box, evaluations: int) -> 
         if gained <= CONVERGED * cost / len(at.residual) and damping < 1:
             break
     return at
-
-
-def _damped_step(
-    curvature: FloatArray, slope: FloatArray, scale: FloatArray, free: BoolArray, damping: float
-) -> FloatArray:
-    unit = scale[free]
-    damped = curvature[np.ix_(free, free)] / np.outer(unit, unit) + damping * np.eye(len(unit))
-    step = np.zeros_like(slope)
-    step[free] = -np.linalg.solve(damped, slope[free] / unit) / unit
-    return np.asarray(np.clip(step, -_LONGEST_STEP, _LONGEST_STEP))

@@ -154,27 +154,22 @@ def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
             least=LEAST_SAMPLES,
         )
     output = np.where(record.ok, record.distance, 0.0)
+    # Each recording has its own offset and drift.
+    background = [np.ones(samples), np.linspace(-1.0, 1.0, samples)]
+    for start, end in pairwise([*record.starts[1:], samples]):
+        for shape in (np.ones(end - start), np.linspace(-1.0, 1.0, end - start)):
+            background.append(np.pad(shape, (start, samples - end)))
     return Problem(
         input=carried - np.mean(motion),
         output=output - np.mean(output[used]),
         used=used,
         period=record.sample_period,
-        background=_offsets_and_drifts(record),
+        background=np.column_stack(background),
         rate=2 * np.pi * input_bandwidth(motion, record.sample_period),
         noise=steps.noise,
         further=np.array([m - np.mean(m) for m in record.further.values()]),
         starts=record.starts,
     )
-
-
-def _offsets_and_drifts(record: MotionRecord) -> FloatArray:
-    """Return columns (n, 2 r) by which each of r recordings has its own offset and drift."""
-    samples = len(record)
-    columns = [np.ones(samples), np.linspace(-1.0, 1.0, samples)]
-    for start, end in pairwise([*record.starts[1:], samples]):
-        for shape in (np.ones(end - start), np.linspace(-1.0, 1.0, end - start)):
-            columns.append(np.pad(shape, (start, samples - end)))
-    return np.column_stack(columns)
 
 
 def joined_recordings(records: Sequence[MotionRecord]) -> MotionRecord:

@@ -147,7 +147,13 @@ def _from_version_1(content: Mapping[str, Any]) -> dict[str, Any]:
         by_pole = -before[:, 1 : len(down)] * value[:, np.newaxis]
         before = np.column_stack([before[:, : len(up)], by_pole])
         weight = 1 / np.maximum(np.abs(value), _FAINT * np.max(np.abs(value)))
-        sections = _denominators_of(roots)
+        real = np.sort(roots[roots.imag == 0].real)
+        pairs = [(p, np.conj(p)) for p in roots if p.imag > 0]
+        # Two neighbours on the axis are one section.
+        pairs += list(zip(real[0:-1:2], real[1::2], strict=True))
+        both = [(-float(((p + q) / (p * q)).real), float((1 / (p * q)).real)) for p, q in pairs]
+        single = [(-1 / p, 0.0) for p in real[len(real) - len(real) % 2 :]]
+        sections = np.reshape(both + single, (-1, 2))
         basis, by_d = _section_columns(sections, w)
         found = _solved(basis, value[:, np.newaxis], weight)[:, 0]
         parts = (basis * found)[:, 1:].reshape(len(w), -1, 2).sum(axis=2)
@@ -157,7 +163,11 @@ def _from_version_1(content: Mapping[str, Any]) -> dict[str, Any]:
             raise CalibrationError("estimation.old_model", misfit=misfit)
         jacobian = np.pad(_solved(after, before, weight), (0, 1))
         jacobian[-1, -1] = not held  # the delay of a held input is exact
-        root = _root_of(covariance)
+        # B with B Bᵀ = covariance, whose parts may have any units.
+        units = np.sqrt(np.diag(covariance))
+        units[units == 0] = 1.0
+        values, vectors = np.linalg.eigh(covariance / np.outer(units, units))
+        root = units[:, np.newaxis] * vectors * np.sqrt(np.maximum(values, 0.0))
         moved = jacobian[:, : len(root)] @ root
         new, count = moved @ moved.T, before.shape[1]
         spread = np.linalg.norm(before @ root[:count], axis=1)
@@ -201,16 +211,6 @@ def _roots_in_w(up: FloatArray, down: FloatArray, period: float) -> ComplexArray
     return roots
 
 
-def _denominators_of(roots: ComplexArray) -> FloatArray:
-    """Return d1, d2 (k, 2) of sections with poles ``roots``, two neighbours on the axis in one."""
-    real = np.sort(roots[roots.imag == 0].real)
-    pairs = [(p, np.conj(p)) for p in roots if p.imag > 0]
-    pairs += list(zip(real[0:-1:2], real[1::2], strict=True))
-    found = [(-float(((p + q) / (p * q)).real), float((1 / (p * q)).real)) for p, q in pairs]
-    single = [(-1 / p, 0.0) for p in real[len(real) - len(real) % 2 :]]
-    return np.reshape(found + single, (-1, 2))
-
-
 def _section_columns(sections: FloatArray, w: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     """Return d H/d(direct, b0, b1 …) (n, 1 + 2k), and what d1, d2 multiply a part by (n, 2k)."""
     w = w[:, np.newaxis]
@@ -228,14 +228,6 @@ def _solved(columns: ComplexArray, values: Any, weight: FloatArray) -> FloatArra
     unit, scale = unit_columns(np.concatenate([left.real, left.imag]))
     found = np.linalg.lstsq(unit, np.concatenate([right.real, right.imag]), rcond=None)[0]
     return np.asarray(found / scale[:, np.newaxis])
-
-
-def _root_of(covariance: FloatArray) -> FloatArray:
-    """Return B with B Bᵀ = covariance, whose parts may have any units."""
-    spread = np.sqrt(np.diag(covariance))
-    spread[spread == 0] = 1.0
-    values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
-    return np.asarray(spread[:, np.newaxis] * vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _check_runs(sections: ParallelSections) -> None:

@@ -89,16 +89,11 @@ def find_steps(z: FloatArray, sample_period: float) -> Steps:
         raise StepTestError("estimation.long_travel", travel=travel, most=_GREATEST_TRAVEL_M)
     if travel <= max(NOISE_FACTOR * noise, 1e-12):
         raise StepTestError("estimation.no_motion", travel=travel, noise=noise)
-    moving = _moving(z, sample_period, max(NOISE_FACTOR * noise, TRAVEL_PART * travel))
-    return Steps(_edges(z, moving), moving, noise, travel)
-
-
-def _moving(z: FloatArray, sample_period: float, threshold: float) -> BoolArray:
-    """Return True where z changes by more than ``threshold`` within _STATIONARY_S."""
     width = min(max(round(_STATIONARY_S / sample_period), 2), len(z) - 1)
-    changes = np.abs(z[width:] - z[:-width]) > threshold
+    changes = np.abs(z[width:] - z[:-width]) > max(NOISE_FACTOR * noise, TRAVEL_PART * travel)
     # A change between k and k + width may lie anywhere between, so the whole window counts.
-    return extended(np.concatenate([changes, np.zeros(width, np.bool_)]), width)
+    moving = extended(np.concatenate([changes, np.zeros(width, np.bool_)]), width)
+    return Steps(_edges(z, moving), moving, noise, travel)
 
 
 def extended(flags: BoolArray, samples: int) -> BoolArray:

@@ -60,7 +60,14 @@ def inter_sample_delay_bound(motion: FloatArray, steps: Steps, sample_period: fl
         increments[max(edge.start - _MARGIN_SAMPLES, 0) : edge.stop + _MARGIN_SAMPLES]
         for edge in steps.edges
     ] or [increments * np.hanning(len(increments))]
-    energy = sum(_top_energy(piece, steps.noise) for piece in pieces)
+    energy = 0.0
+    for piece in pieces:
+        frequency = np.fft.rfftfreq(len(piece))
+        band = (frequency >= _TOP_BAND[0]) & (frequency <= _TOP_BAND[1])
+        doubled = np.abs(1 - np.exp(-2j * np.pi * frequency[band])) ** 2
+        power = np.abs(np.fft.rfft(piece))[band] ** 2
+        # Less what noise of the encoder gives.
+        energy += float(np.mean(power - len(piece) * steps.noise**2 * doubled))
     height = sum(float(np.sum(np.abs(piece))) ** 2 for piece in pieces)
     if energy <= 0:
         return 0.0
@@ -68,15 +75,6 @@ def inter_sample_delay_bound(motion: FloatArray, steps: Steps, sample_period: fl
     at_top = 0.5 * sample_period * np.sqrt(energy / height)
     at_rate = at_top * (0.5 * sum(_TOP_BAND)) ** 3
     return float(2 * at_rate * (1 + _GREATEST_GAIN_BEYOND))
-
-
-def _top_energy(increments: FloatArray, noise: float) -> float:
-    """Return mean |FFT of the increments|² in the top band [m²], less what encoder noise gives."""
-    power = np.abs(np.fft.rfft(increments)) ** 2
-    frequency = np.fft.rfftfreq(len(increments))
-    band = (frequency >= _TOP_BAND[0]) & (frequency <= _TOP_BAND[1])
-    doubled = np.abs(1 - np.exp(-2j * np.pi * frequency[band])) ** 2
-    return float(np.mean(power[band] - len(increments) * noise**2 * doubled))
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,7 +44,7 @@ from omsm_ros.core.estimation.covariance import with_random_walk
 from omsm_ros.core.estimation.model_structure import Fit
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.preparation import Prepared, check_axis_steps, check_gain, prepare
-from omsm_ros.core.estimation.steps import Edge, find_steps
+from omsm_ros.core.estimation.steps import find_steps
 from omsm_ros.core.identification.checks import CHECKS, limits_of
 from omsm_ros.core.identification.covariance_terms import (
     contrast_covariance,
@@ -389,11 +389,14 @@ def static_gains(record: MotionRecord) -> StaticGain:
     Raises StepTestError with fewer than four plateaus.
     """
     steps = find_steps(record.z, record.sample_period)
+    begun = [0, *(edge.stop + round(_SETTLE_S / record.sample_period) for edge in steps.edges)]
+    ended = [*(edge.start for edge in steps.edges), len(record)]
+    whole = [(a, b) for a, b in zip(begun, ended, strict=True) if b - a >= 5]
+    if len(whole) < _LEAST_PLATEAUS:
+        raise StepTestError("identification.few_plateaus", found=len(whole), least=_LEAST_PLATEAUS)
     rests = [
         piece
-        for a, b in _stationary_segments(
-            steps.edges, len(record), round(_SETTLE_S / record.sample_period)
-        )
+        for a, b in whole
         for piece in pairwise([a, *(start for start in record.starts if a < start < b), b])
     ]
     readings = np.where(record.ok, record.distance, np.nan)
@@ -410,17 +413,6 @@ def static_gains(record: MotionRecord) -> StaticGain:
         probe_per_reference=ratio(reference, probe),
         reference_per_encoder=ratio(encoder, reference),
     )
-
-
-def _stationary_segments(
-    edges: tuple[Edge, ...], samples: int, settle: int
-) -> list[tuple[int, int]]:
-    starts = [0, *(edge.stop + settle for edge in edges)]
-    stops = [*(edge.start for edge in edges), samples]
-    rests = [(a, b) for a, b in zip(starts, stops, strict=True) if b - a >= 5]
-    if len(rests) < _LEAST_PLATEAUS:
-        raise StepTestError("identification.few_plateaus", found=len(rests), least=_LEAST_PLATEAUS)
-    return rests
 
 
 def _means(values: FloatArray, rests: list[tuple[int, int]]) -> FloatArray:

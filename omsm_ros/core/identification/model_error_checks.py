@@ -37,7 +37,6 @@ from omsm_ros.core.model_errors.families import (
     ModelErrorTerm,
 )
 from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM, ResidualDiagnostics
-from omsm_ros.core.streams.blocks import FloatArray
 
 # Standard uncertainty of a height over the size of an error: the rms of a sine. Backlash and
 # friction lag by their whole half widths together; drift and linearity are no errors of motion.
@@ -116,20 +115,17 @@ def model_errors(searched: SearchResult) -> Iterator[Finding]:
         term = modelled.term
         # A drift that wanders has power at low frequencies, where a line is a part of it.
         slow = term.parameter * searched.diagnostics.plateau < 1
-        if not (drifts and slow and term.family == VIBRATION):
-            yield _finding(searched, modelled, _values(term, size, period))
+        if drifts and slow and term.family == VIBRATION:
+            continue
+        code, values = _NUISANCE_CODES[term.family], _values(term, size, period)
+        alike = _alike(searched, modelled) if term.family in _MAY_LOOK_ALIKE else []
+        if alike:
+            code = "identification.undecided"
+            values["causes"] = [_MAY_LOOK_ALIKE[name] for name in (term.family, *alike)]
+        yield Finding(code, RESERVATION, values)
     for term in searched.added_poles:
         values = _values(term, None, period)
         yield Finding(_IN_RESPONSE_CODES[term.family], RESERVATION, values)
-
-
-def _finding(searched: SearchResult, modelled: ModelledTerm, values: dict[str, object]) -> Finding:
-    family = modelled.term.family
-    alike = _alike(searched, modelled) if family in _MAY_LOOK_ALIKE else []
-    if not alike:
-        return Finding(_NUISANCE_CODES[family], RESERVATION, values)
-    names = [_MAY_LOOK_ALIKE[name] for name in (family, *alike)]
-    return Finding("identification.undecided", RESERVATION, {**values, "causes": names})
 
 
 def _alike(searched: SearchResult, modelled: ModelledTerm) -> list[str]:
@@ -213,7 +209,9 @@ def _sizes(searched: SearchResult) -> tuple[Sequence[Size], float]:
             # The further column is its unknown state at the start.
             coefficients, spread = coefficients[:1], spread[:1, :1]
             at_reversals[modelled.columns.start] = 1.0
-        significant = _significant(coefficients, spread, modelled.term.trials)
+        inverse = np.linalg.pinv(spread, rcond=1e-9, hermitian=True)
+        wald = stats.chi2.sf(float(coefficients @ inverse @ coefficients), len(coefficients))
+        significant = bool(wald * modelled.term.trials < FALSE_ALARM)
         if modelled.term.family == DRIFT:
             value = float(np.std(problem.background[:, modelled.columns] @ coefficients))
             uncertainty = float(np.sqrt(max(np.trace(spread), 0.0) / 2))
@@ -223,10 +221,3 @@ def _sizes(searched: SearchResult) -> tuple[Sequence[Size], float]:
         found.append(Size(value, uncertainty, significant))
     variance = max(float(at_reversals @ of_background @ at_reversals), 0.0)
     return found, float(np.hypot(at_reversals @ fit.background, np.sqrt(variance)))
-
-
-def _significant(coefficients: FloatArray, covariance: FloatArray, trials: float) -> bool:
-    """Return whether ``coefficients`` (c,) differ from zero (Wald's test) by more than chance."""
-    inverse = np.linalg.pinv(covariance, rcond=1e-9, hermitian=True)
-    chi_square = float(coefficients @ inverse @ coefficients)
-    return bool(stats.chi2.sf(chi_square, len(coefficients)) * trials < FALSE_ALARM)

@@ -148,9 +148,14 @@ class _Search:
         present = {modelled.term.family for modelled in self.nuisance_terms}
         again = {judged.term.family for judged in columns} & _TURNING & present
         if again:
-            self.prepared, self.nuisance_terms = _recomputed_columns(
-                self.prepared, diagnostics, self.nuisance_terms, again
-            )
+            background = self.prepared.problem.background.copy()
+            for place, modelled in enumerate(self.nuisance_terms):
+                if modelled.term.family in again:
+                    term = diagnostics.model_errors.again(modelled.term)
+                    background[:, modelled.columns] = term.columns
+                    self.nuisance_terms[place] = ModelledTerm(term, modelled.columns)
+            problem = replace(self.prepared.problem, background=background)
+            self.prepared = replace(self.prepared, problem=problem)
             self.settled |= again
         elif columns:
             self.prepared, added = _with_columns(self.prepared, columns, self.nuisance_terms)
@@ -292,22 +297,6 @@ def _with_columns(
         added.append(ModelledTerm(judged.term, slice(start, background.shape[1])))
     problem = replace(prepared.problem, background=background)
     return replace(prepared, problem=problem), added
-
-
-def _recomputed_columns(
-    prepared: Prepared,
-    diagnostics: ResidualDiagnostics,
-    nuisance_terms: Sequence[ModelledTerm],
-    families: set[str],
-) -> tuple[Prepared, list[ModelledTerm]]:
-    background, renewed = prepared.problem.background.copy(), []
-    for modelled in nuisance_terms:
-        term = modelled.term
-        if term.family in families:
-            term = diagnostics.model_errors.again(term)
-            background[:, modelled.columns] = term.columns
-        renewed.append(ModelledTerm(term, modelled.columns))
-    return replace(prepared, problem=replace(prepared.problem, background=background)), renewed
 
 
 def _grown(

@@ -22,7 +22,7 @@ from omsm_ros.core.estimation.noise import (
 )
 from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.estimation.steps import Steps, extended
-from omsm_ros.core.lti.frequency_response import FrequencyResponse, frequency_response
+from omsm_ros.core.lti.frequency_response import frequency_response
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.statistics import white_noise
 
@@ -155,30 +155,22 @@ def independence(residual: FloatArray, drive: FloatArray, lags: int = _LAGS) -> 
     return float(stats.chi2.sf(statistic, np.sum(kept))) if np.any(kept) else 1.0
 
 
-def response_agreement(residual: FrequencyResponse, up_to: float) -> float:
-    """Return the mean square difference of two responses over its variance, 0 to ``up_to`` [Hz].
-
-    residual: response of the residual, estimated without a model: that of the measured output
-        less that of the modelled output, both through the same windows. The leakage of a
-        lightly damped mode is in both, and cancels.
-    NaN where there is no line.
-    """
-    lines = (residual.frequency > 0) & (residual.frequency <= up_to)
-    if not np.any(lines):
-        return float("nan")
-    # Bendat and Piersol's uncertainty is relative, to a response that is all difference.
-    return float(np.mean(0.5 / residual.uncertainty[lines] ** 2))
-
-
 def response_difference(problem: Problem, best: Fit, up_to: float) -> float | None:
     """Return the mean square difference from a response without a model, over its variance.
 
-    up_to: highest frequency compared [Hz]. None where the two cannot be compared: the estimate
-    takes the residual for noise that is alike everywhere, which rounding without noise is not.
+    up_to: highest frequency compared [Hz]
+
+    The response of the residual is estimated: that of the measured output less that of the modelled
+    output, both through the same windows. The leakage of a lightly damped mode is in both, and
+    cancels. None where there is no line, or the two cannot be compared: the estimate takes the
+    residual for noise that is alike everywhere, which rounding without noise is not.
     """
     residual = problem.on_grid(best.residual, 0.0)
     segment = min(round(_AGREEMENT_SEGMENT_S / problem.period), len(residual) // _LEAST_SEGMENTS)
-    value = response_agreement(
-        frequency_response(problem.input, residual, problem.period, max(segment, 16)), up_to
-    )
-    return value if np.isfinite(value) and problem.shared == 0 else None
+    found = frequency_response(problem.input, residual, problem.period, max(segment, 16))
+    lines = (found.frequency > 0) & (found.frequency <= up_to)
+    if problem.shared > 0 or not np.any(lines):
+        return None
+    # Bendat and Piersol's uncertainty is relative, to a response that is all difference.
+    value = float(np.mean(0.5 / found.uncertainty[lines] ** 2))
+    return value if np.isfinite(value) else None

@@ -138,7 +138,15 @@ def inflate_to_free_choice(
 
 
 def _trusted_up_to(model: ChosenModel, band: Band, limits: ResponseLimits, shown: float) -> float:
-    return min(trusted_up_to(band, limits, _disagreement(model, band)), shown)
+    chosen = model.chosen.fit.dynamics.response(band.frequency)
+    gain, phase = np.zeros(len(chosen)), np.zeros(len(chosen))
+    best = min(c.bic for c in model.candidates)
+    for other in model.candidates:
+        if other.bic < best + _EQUALLY_GOOD_BIC:
+            difference = np.log(other.fit.dynamics.response(band.frequency) / chosen)
+            gain = np.maximum(gain, np.abs(difference.real))
+            phase = np.maximum(phase, np.abs(difference.imag))
+    return min(trusted_up_to(band, limits, Band(band.frequency, gain, phase)), shown)
 
 
 def _excited_up_to(problem: Problem, best: Fit, limits: ResponseLimits) -> float:
@@ -166,15 +174,3 @@ def _symmetric(matrix: FloatArray) -> FloatArray:
 def _frequencies(problem: Problem) -> FloatArray:
     nyquist = 0.5 / problem.period
     return np.asarray(np.geomspace(1e-4 * nyquist, nyquist, _FREQUENCIES))
-
-
-def _disagreement(model: ChosenModel, band: Band) -> Band:
-    chosen = model.chosen.fit.dynamics.response(band.frequency)
-    gain, phase = np.zeros(len(chosen)), np.zeros(len(chosen))
-    best = min(c.bic for c in model.candidates)
-    for other in model.candidates:
-        if other.bic < best + _EQUALLY_GOOD_BIC:
-            difference = np.log(other.fit.dynamics.response(band.frequency) / chosen)
-            gain = np.maximum(gain, np.abs(difference.real))
-            phase = np.maximum(phase, np.abs(difference.imag))
-    return Band(band.frequency, gain, phase)

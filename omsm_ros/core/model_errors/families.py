@@ -292,24 +292,21 @@ class ModelErrorFamilies:
 
         ladder: frequencies [Hz] and damping ratios; empty for all
         """
-        found = ladder or self._mode_frequencies()
+        lowest = 2 / self.duration
+        highest = min(self.problem.rate / np.pi, 0.25 / self.problem.period, FASTEST_MODE_HZ)
+        highest = max(highest, 2 * lowest)
+        span = np.log(highest / lowest)
+        found = ladder or [
+            (frequency, damping)
+            for damping in _DAMPINGS
+            for frequency in np.geomspace(lowest, highest, int(span / (2 * damping)) + 1)
+        ]
 
         def part(first: int, last: int) -> FloatArray:
             return np.concatenate([self.mode(*each).T for each in found[first:last]]).T
 
         frequencies, dampings = np.array(found).T
         return ModelErrorFamily(MODE, frequencies, len(found) / 2, part, 2, dampings)
-
-    def _mode_frequencies(self) -> list[tuple[float, float]]:
-        lowest = 2 / self.duration
-        highest = min(self.problem.rate / np.pi, 0.25 / self.problem.period, FASTEST_MODE_HZ)
-        highest = max(highest, 2 * lowest)
-        span = np.log(highest / lowest)
-        return [
-            (frequency, damping)
-            for damping in _DAMPINGS
-            for frequency in np.geomspace(lowest, highest, int(span / (2 * damping)) + 1)
-        ]
 
     def mode(self, frequency: float, damping: float) -> FloatArray:
         """Return the columns (n, 2) of the mode at ``frequency`` [Hz], as in :meth:`modes`."""

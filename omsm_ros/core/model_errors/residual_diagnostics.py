@@ -10,7 +10,7 @@ parts of the test (steps up and down, small and large, early and late) by ``±d`
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -407,18 +407,14 @@ def differ(compared: PartsCompared) -> bool:
 def contrasts(diagnostics: ResidualDiagnostics) -> list[PartsCompared]:
     """Return the contrasts that the steps of this test allow."""
     starts, samples = diagnostics.problem.starts, len(diagnostics.problem.input)
-    weights = [*_weights(diagnostics.steps, samples), *_recordings(starts, samples)]
+    weights = dict(_weights(diagnostics.steps, samples))
     if len(starts) > 1:
-        weights = [(name, weight) for name, weight in weights if name != HALVES]
-    return [_contrast_of(diagnostics, name, weight) for name, weight in weights]
-
-
-def _recordings(starts: Sequence[int], samples: int) -> Iterator[tuple[str, FloatArray]]:
-    """Yield 1 in one recording and -1 in the others, (n,), for each of several."""
+        weights.pop(HALVES, None)
     place = np.searchsorted(starts, np.arange(samples), side="right")
-    # The second of two adds nothing to the first.
+    # The second of two recordings adds nothing to the first.
     for number in range(1, len(starts) + 1 - (len(starts) <= 2)):
-        yield RECORDING.format(number), np.where(place == number, 1.0, -1.0)
+        weights[RECORDING.format(number)] = np.where(place == number, 1.0, -1.0)
+    return [_contrast_of(diagnostics, name, weight) for name, weight in weights.items()]
 
 
 def _weights(steps: Steps, samples: int) -> Iterator[tuple[str, FloatArray]]:
