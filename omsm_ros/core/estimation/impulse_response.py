@@ -60,22 +60,17 @@ def gram_of(inputs: FloatArray, target: FloatArray, taps: int) -> tuple[FloatArr
         moment[i] = signal.correlate(first, target, "valid", "fft")[::-1]
         means[i] = signal.correlate(first, np.ones(samples), "valid", "fft")[::-1] / samples
         for j, second in enumerate(inputs.T):
-            gram[i, :, j] = _cross_gram(first, second, samples, taps)
+            # By its first row and column and a recursion.
+            part = gram[i, :, j]
+            part[0] = signal.correlate(second, first[-samples:], "valid", "fft")[::-1]
+            part[:, 0] = signal.correlate(first, second[-samples:], "valid", "fft")[::-1]
+            before, last = taps - 2 - np.arange(taps - 1), len(first) - 1 - np.arange(taps - 1)
+            for k in range(1, taps):
+                part[k, 1:] = part[k - 1, :-1] + first[taps - 1 - k] * second[before]
+                part[k, 1:] -= first[len(first) - k] * second[last]
     centred = np.ravel(means)
     found = gram.reshape(count * taps, -1) - samples * np.outer(centred, centred)
     return found, np.ravel(moment)
-
-
-def _cross_gram(first: FloatArray, second: FloatArray, samples: int, taps: int) -> FloatArray:
-    """Return Σ_k first[k - i] second[k - j] (L, L), by its first row and column and a recursion."""
-    found = np.empty((taps, taps))
-    found[0] = signal.correlate(second, first[-samples:], "valid", "fft")[::-1]
-    found[:, 0] = signal.correlate(first, second[-samples:], "valid", "fft")[::-1]
-    before, last = taps - 2 - np.arange(taps - 1), len(first) - 1 - np.arange(taps - 1)
-    for i in range(1, taps):
-        found[i, 1:] = found[i - 1, :-1] + first[taps - 1 - i] * second[before]
-        found[i, 1:] -= first[len(first) - i] * second[last]
-    return found
 
 
 def coherent_power(inputs: FloatArray, output: FloatArray) -> FloatArray:

@@ -13,17 +13,18 @@ h1 = (h/T - 1)/s, h0 = h - h1.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import polynomial
-from scipy import fft
+from scipy import fft, linalg
 
 from omsm_ros.core.kinematics.trajectories import s_curve
 from omsm_ros.core.lti.frequency_response import Band
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.linear_algebra import sosfilt
+from omsm_ros.linear_algebra import inverse_gram, sosfilt
 
 BAND_LIMITED, ZERO_ORDER, FIRST_ORDER = "band-limited", "zero-order", "first-order"
 HOLDS = (BAND_LIMITED, ZERO_ORDER, FIRST_ORDER)
@@ -285,6 +286,21 @@ def orthogonal_decays(downs: list[FloatArray], samples: int) -> FloatArray:
     return rows
 
 
+def basis_of(sections: FloatArray, w: ComplexArray) -> ComplexArray:
+    """Return 1, then 1/S and w/S of each section S at ``w`` (k,), (1 + n, k).
+
+    There is no w/S of a single pole.
+    """
+    found, place = np.empty((1 + int(np.count_nonzero(sections)), len(w)), np.complex128), 1
+    found[0] = 1.0
+    for d1, d2 in sections:
+        np.divide(1.0, 1.0 + w * (d1 + d2 * w), out=found[place])
+        if d2 > 0:
+            np.multiply(w, found[place], out=found[place + 1])
+        place += 1 + (d2 > 0)
+    return found
+
+
 def _polynomial_of(poles: ComplexArray) -> list[float]:
     if len(poles) == 1:
         return [float((-1 / poles[0]).real), 0.0]
@@ -306,3 +322,46 @@ def _product(factors: list[FloatArray]) -> FloatArray:
     for factor in factors:
         found = np.asarray(polynomial.polymul(found, factor), np.float64)
     return found
+
+
+# Least damping ratio that a start may have, and range of its |poles|.
+_LEAST_DAMPING, _SLOWEST, _FASTEST = 1e-5, 1e-6, 1e4
+
+
+def relocated(
+    poles: ComplexArray, data: Sequence[tuple[ComplexArray, ComplexArray, ComplexArray]]
+) -> ComplexArray:
+    """Return the zeros of σ with σ Y ≈ Σ_j N_j U_j + transients, all over ``poles`` (n,).
+
+    data: of each record w (k,), inputs (m, k) and output (k,). The zeros are reflected into the
+    left half plane, and kept within the range of a start.
+    """
+    upper, real = poles[poles.imag > 0], poles[poles.imag == 0].real
+    grams = []
+    for w, inputs, output in data:
+        pairs = [np.array([1 / (w - p), 1 / (w - np.conj(p))]) for p in upper]
+        basis = [b for one, other in pairs for b in (one + other, 1j * (one - other))]
+        fractions = np.reshape([*basis, *(1 / (w - p) for p in real)], (-1, len(w)))
+        direct = np.concatenate([fractions, np.ones((1, len(w)))])
+        free, driven = [*direct, w], (direct * inputs[:, np.newaxis]).reshape(-1, len(w))
+        rows = stacked(np.concatenate([free, driven, -fractions * output, output[np.newaxis]]))
+        (own, cross), (_, shared) = (
+            np.split(p, [len(free)], 1) for p in np.split(rows @ rows.T, [len(free)])
+        )
+        grams.append(shared - cross.T @ inverse_gram(own) @ cross)
+    gram = np.sum(grams, axis=0)
+    solved = inverse_gram(gram[:-1, :-1]) @ gram[:-1, -1]
+    blocks = [[[p.real, p.imag], [-p.imag, p.real]] for p in upper]
+    a = linalg.block_diag(*blocks, *([[p]] for p in real))
+    b = np.concatenate([np.tile([2.0, 0.0], len(upper)), np.ones(len(real))])
+    found = np.asarray(np.linalg.eigvals(a - np.outer(b, solved[-len(poles) :])), np.complex128)
+    size = np.clip(np.abs(found), _SLOWEST, _FASTEST)
+    found = found * size / np.maximum(np.abs(found), np.finfo(float).tiny)
+    real = found.imag == 0
+    decay = np.maximum(np.abs(found.real), _LEAST_DAMPING * size)
+    return np.where(real, -size, -decay + 1j * found.imag)
+
+
+def stacked(values: ComplexArray) -> FloatArray:
+    """Return real and imaginary parts of ``values`` (q, k) side by side, (q, 2k)."""
+    return np.concatenate([values.real, values.imag], axis=1)

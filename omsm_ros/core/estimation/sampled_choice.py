@@ -164,7 +164,12 @@ def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsPr
 
     Where the inputs are slow, the records are decimated. Samples of slow inputs are band-limited.
     """
-    every = min(_decimation(record) for record in whole.records)
+    shares: list[float] = []
+    for record in whole.records:
+        power = np.sum(np.abs(np.fft.rfft(record.inputs, axis=0)) ** 2, axis=1)
+        total = np.cumsum([power, coherent_power(record.inputs, record.filled())], axis=1)
+        shares += np.mean(total < _CONTENT * total[:, -1:], axis=1).tolist()
+    every = max(int(1 / max(np.max(shares) * _ABOVE_CONTENT, 1e-3)), 1)
     while every:
         thinned = []
         for record in whole.records:
@@ -440,11 +445,3 @@ def _against_impulse_response(
     shares = 1 - np.mean(means, axis=1)
     worse = float(np.mean(apart)) > max(_CLEARLY * uncertain, _NOTICEABLE)
     return {"comparator": float(shares[0]), "model": float(shares[1])}, bool(worse)
-
-
-def _decimation(record: SampledRecord) -> int:
-    """Return how many samples are one that keeps the inputs, and the output that follows them."""
-    power = np.sum(np.abs(np.fft.rfft(record.inputs, axis=0)) ** 2, axis=1)
-    total = np.cumsum([power, coherent_power(record.inputs, record.filled())], axis=1)
-    share = float(np.max(np.mean(total < _CONTENT * total[:, -1:], axis=1)))
-    return max(int(1 / max(share * _ABOVE_CONTENT, 1e-3)), 1)

@@ -25,9 +25,12 @@ from omsm_ros.core.estimation.optimisation import Projection, descend
 from omsm_ros.core.estimation.parallel_sections import (
     BAND_LIMITED,
     ParallelSections,
+    basis_of,
     closed_inputs,
     orthogonal_decays,
     recursion,
+    relocated,
+    stacked,
     variable,
 )
 from omsm_ros.core.lti.transfer_function import ComplexArray, Structure
@@ -44,8 +47,6 @@ _MOST_LINES = 4000
 _RELOCATIONS, _RACE = 10, 3
 # Damping ratio of pairs at a start, those that are tried for a line of the residual, and the lines.
 _START_DAMPING, _ADDED_DAMPINGS, _TRIED_LINES = 0.05, (0.002, 0.01, 0.05), 40
-# Least damping ratio that a start may have, and range of |pole| T / RATE in a start.
-_LEAST_DAMPING, _SLOWEST, _FASTEST = 1e-5, 1e-6, 1e4
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,10 +230,9 @@ class SectionsProblem:
             change = inverse @ np.sum([part.rows @ rest for part, rest in pairs], axis=0)
             left = [part.without_free(rest - change @ part.rows) for part, rest in pairs]
             linear += change
-        found = linear.reshape(self.inputs, -1)
 
         def normal() -> tuple[FloatArray, FloatArray]:
-            each = [(part, part.slopes(found)) for part in parts]
+            each = [(part, part.slopes(linear.reshape(self.inputs, -1))) for part in parts]
             own = [part.along_free(slopes) for part, slopes in each]
             mixed = [
                 slopes @ part.rows.T - along @ part.along.T
@@ -286,7 +286,7 @@ class SectionsProblem:
         single = np.full(order % 2, -np.sqrt(low * high))
         poles = np.concatenate([upper, np.conj(upper), single])
         for _ in range(_RELOCATIONS):
-            poles = _stable(_relocate(poles, data))
+            poles = relocated(poles, data)
         return self.nonlinear_of(poles, late)
 
     def covariance(self, fitted: SectionsFit, period: float) -> FloatArray:
@@ -309,7 +309,11 @@ class SectionsProblem:
             start += len(one.places)
             length = fft.next_fast_len(len(one.record) + 64, real=True)
             length += length % 2
-            leverage = leverage_of(np.concatenate([basis, part.free_basis()]), length)
+            # An orthonormal basis of the responses to initial states and the offset.
+            after = len(one.places) - part.free.shape[1]
+            free = np.pad(part.free, ((0, 1), (0, after))) - np.append(part.mean, -1)[:, None]
+            free = linalg.block_diag(part.root, len(one.places) ** -0.5).T @ free
+            leverage = leverage_of(np.concatenate([basis, free]), length)
             on_grid = np.zeros((len(basis), len(one.record)))
             on_grid[:, one.places] = basis
             score += weighted_gram(on_grid, length, noise_spectrum(residual, length, leverage))
@@ -408,12 +412,6 @@ class _Columns:
         self.add_free(-self.along_free(values), values)
         return values
 
-    def free_basis(self) -> FloatArray:
-        """Return an orthonormal basis (r + 1, places) of the free responses and the offset."""
-        count, end = len(self.one.places), self.free.shape[1]
-        rows = np.pad(self.free, ((0, 1), (0, count - end))) - np.append(self.mean, -1)[:, None]
-        return np.asarray(linalg.block_diag(self.root, count**-0.5).T @ rows)
-
     def slopes(self, linear: FloatArray) -> FloatArray:
         """Return d output / d nonlinear (p, places) at the ``linear`` parameters (m, 1 + n)."""
         one, sections, basis = self.one, self._sections, self._basis
@@ -449,21 +447,6 @@ def sections_of(nonlinear: FloatArray, order: int) -> FloatArray:
     return found
 
 
-def basis_of(sections: FloatArray, w: ComplexArray) -> ComplexArray:
-    """Return 1, then 1/S and w/S of each section S at ``w`` (k,), (1 + n, k).
-
-    There is no w/S of a single pole.
-    """
-    found, place = np.empty((1 + int(np.count_nonzero(sections)), len(w)), np.complex128), 1
-    found[0] = 1.0
-    for d1, d2 in sections:
-        np.divide(1.0, 1.0 + w * (d1 + d2 * w), out=found[place])
-        if d2 > 0:
-            np.multiply(w, found[place], out=found[place + 1])
-        place += 1 + (d2 > 0)
-    return found
-
-
 def grown_starts(problem: SectionsProblem, smaller: SectionsFit, order: int) -> list[ComplexArray]:
     """Return starts, poles (order,) in w: of ``smaller``, and fast, slow or missing ones."""
     more, own = order - smaller.order, smaller.roots()
@@ -495,9 +478,9 @@ def _missing_pairs(problem: SectionsProblem, fitted: SectionsFit, count: int) ->
         rate = abs(one.w[line])
         for damping in _ADDED_DAMPINGS:
             basis = basis_of(np.array([[2 * damping / rate, 1 / rate**2]]), one.w)[1:]
-            rows = _stacked((drives * basis).reshape(-1, len(one.w)))
+            rows = stacked((drives * basis).reshape(-1, len(one.w)))
             tried.append((rate * (1j - damping), rows, inverse_gram(rows @ rows.T)))
-    left, found = _stacked(spectrum[np.newaxis])[0], []
+    left, found = stacked(spectrum[np.newaxis])[0], []
     for _ in range(count if tried else 0):
         along = [rows @ left for _, rows, _ in tried]
         best = int(np.argmax([a @ one[2] @ a for a, one in zip(along, tried, strict=True)]))
@@ -505,41 +488,3 @@ def _missing_pairs(problem: SectionsProblem, fitted: SectionsFit, count: int) ->
         left = left - (inverse @ along[best]) @ rows
         found.append(pole)
     return np.array(found, np.complex128)
-
-
-def _relocate(
-    poles: ComplexArray, data: Sequence[tuple[ComplexArray, ComplexArray, ComplexArray]]
-) -> ComplexArray:
-    """Return the zeros of σ with σ Y ≈ Σ_j N_j U_j + transients, all over ``poles`` (n,)."""
-    upper, real = poles[poles.imag > 0], poles[poles.imag == 0].real
-    grams = []
-    for w, inputs, output in data:
-        pairs = [np.array([1 / (w - p), 1 / (w - np.conj(p))]) for p in upper]
-        basis = [b for one, other in pairs for b in (one + other, 1j * (one - other))]
-        fractions = np.reshape([*basis, *(1 / (w - p) for p in real)], (-1, len(w)))
-        direct = np.concatenate([fractions, np.ones((1, len(w)))])
-        free, driven = [*direct, w], (direct * inputs[:, np.newaxis]).reshape(-1, len(w))
-        rows = _stacked(np.concatenate([free, driven, -fractions * output, output[np.newaxis]]))
-        (own, cross), (_, shared) = (
-            np.split(p, [len(free)], 1) for p in np.split(rows @ rows.T, [len(free)])
-        )
-        grams.append(shared - cross.T @ inverse_gram(own) @ cross)
-    gram = np.sum(grams, axis=0)
-    solved = inverse_gram(gram[:-1, :-1]) @ gram[:-1, -1]
-    blocks = [[[p.real, p.imag], [-p.imag, p.real]] for p in upper]
-    a = linalg.block_diag(*blocks, *([[p]] for p in real))
-    b = np.concatenate([np.tile([2.0, 0.0], len(upper)), np.ones(len(real))])
-    return np.asarray(np.linalg.eigvals(a - np.outer(b, solved[-len(poles) :])), np.complex128)
-
-
-def _stacked(values: ComplexArray) -> FloatArray:
-    return np.concatenate([values.real, values.imag], axis=1)
-
-
-def _stable(poles: ComplexArray) -> ComplexArray:
-    """Return ``poles`` reflected into the left half plane, within the range of a start."""
-    size = np.clip(np.abs(poles), _SLOWEST, _FASTEST)
-    poles = poles * size / np.maximum(np.abs(poles), np.finfo(float).tiny)
-    real = poles.imag == 0
-    decay = np.maximum(np.abs(poles.real), _LEAST_DAMPING * size)
-    return np.where(real, -size, -decay + 1j * poles.imag)

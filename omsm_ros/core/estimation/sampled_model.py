@@ -163,11 +163,7 @@ def _from_version_1(content: Mapping[str, Any]) -> dict[str, Any]:
             raise CalibrationError("estimation.old_model", misfit=misfit)
         jacobian = np.pad(_solved(after, before, weight), (0, 1))
         jacobian[-1, -1] = not held  # the delay of a held input is exact
-        # B with B Bᵀ = covariance, whose parts may have any units.
-        units = np.sqrt(np.diag(covariance))
-        units[units == 0] = 1.0
-        values, vectors = np.linalg.eigh(covariance / np.outer(units, units))
-        root = units[:, np.newaxis] * vectors * np.sqrt(np.maximum(values, 0.0))
+        root = _root_of(covariance)
         moved = jacobian[:, : len(root)] @ root
         new, count = moved @ moved.T, before.shape[1]
         spread = np.linalg.norm(before @ root[:count], axis=1)
@@ -228,6 +224,14 @@ def _solved(columns: ComplexArray, values: Any, weight: FloatArray) -> FloatArra
     unit, scale = unit_columns(np.concatenate([left.real, left.imag]))
     found = np.linalg.lstsq(unit, np.concatenate([right.real, right.imag]), rcond=None)[0]
     return np.asarray(found / scale[:, np.newaxis])
+
+
+def _root_of(covariance: FloatArray) -> FloatArray:
+    """Return B with B Bᵀ = covariance, whose parts may have any units."""
+    spread = np.sqrt(np.diag(covariance))
+    spread[spread == 0] = 1.0
+    values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
+    return np.asarray(spread[:, np.newaxis] * vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _check_runs(sections: ParallelSections) -> None:

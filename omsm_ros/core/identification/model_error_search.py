@@ -162,18 +162,15 @@ class _Search:
             self.nuisance_terms = [*self.nuisance_terms, *added]
             self.grown, self.without = [], []
         else:
-            return self._add_poles(diagnostics, shown[0].term)
+            larger = _grown(self.prepared, self.model, shown[0].term, self.budget)
+            if larger is None:
+                self.refused.add(shown[0].term.family)
+                return False
+            self.prepared, self.model = larger
+            self.grown.append(at_fitted_pole(shown[0].term, self.model.chosen.fit))
+            self.without.append(diagnostics)
+            return True
         self.prepared, self.model = self.choose(self.prepared, self.budget)
-        return True
-
-    def _add_poles(self, diagnostics: ResidualDiagnostics, term: ModelErrorTerm) -> bool:
-        larger = _grown(self.prepared, self.model, term, self.budget)
-        if larger is None:
-            self.refused.add(term.family)
-            return False
-        self.prepared, self.model = larger
-        self.grown.append(at_fitted_pole(term, self.model.chosen.fit))
-        self.without.append(diagnostics)
         return True
 
 

@@ -67,8 +67,16 @@ def polynomial_hold_zeros(
     if not len(poles):
         return np.empty(0, np.complex128)
     system = _series(zeros, poles)
-    step, weights = _hold_integrals(system.a, system.b, order)
-    n = len(step)
+    n = len(system.a)
+    # With a chain of integrators as input, one exponential contains ∫ e^{a(1-v)} b v^j/j! dv.
+    chain = np.zeros((n + order + 1, n + order + 1))
+    chain[:n, :n], chain[:n, n], chain[n:, n:] = system.a, system.b, np.eye(order + 1, k=1)
+    exponential = scipy.linalg.expm(chain)
+    monomials = exponential[:n, n:] * [factorial(j) for j in range(order + 1)]
+    nodes = 1.0 - np.arange(order + 1)
+    # exp(a), and the weights w_j (n, order + 1) of u[k], u[k-1], … from k-1 to k.
+    step = exponential[:n, :n]
+    weights = monomials @ np.linalg.inv(np.vander(nodes, increasing=True))
     # States (x[k-1], u[k-1] … u[k-m]).
     transition = np.block([[step, weights[:, 1:]], [np.zeros((order, n)), np.eye(order, k=-1)]])
     entry = np.concatenate([weights[:, 0], np.eye(order)[0]])
@@ -152,21 +160,6 @@ def _section(numerator: FloatArray, denominator: FloatArray) -> _StateSpace:
     a = omega * np.eye(n, k=1)
     a[-1] = -omega * monic[:n]
     return _StateSpace(a, omega * np.eye(n)[-1], c, direct)
-
-
-def _hold_integrals(a: FloatArray, b: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
-    """Return exp(a) and the weights w_j (n, order + 1) of u[k], u[k-1], … from k-1 to k."""
-    n = len(a)
-    # With a chain of integrators as input, one exponential contains ∫ e^{a(1-v)} b v^j/j! dv.
-    chain = np.zeros((n + order + 1, n + order + 1))
-    chain[:n, :n] = a
-    chain[:n, n] = b
-    chain[n:, n:] = np.eye(order + 1, k=1)
-    exponential = scipy.linalg.expm(chain)
-    monomials = exponential[:n, n:] * [factorial(j) for j in range(order + 1)]
-    nodes = 1.0 - np.arange(order + 1)
-    coefficients = np.linalg.inv(np.vander(nodes, increasing=True))
-    return exponential[:n, :n], np.asarray(monomials @ coefficients)
 
 
 @dataclass(frozen=True, eq=False)

@@ -115,7 +115,11 @@ def modal_remainder(dynamics: TransferFunction, up_to: float) -> float | None:
 
 
 def _known(dynamics: TransferFunction, pole: complex, covariance: FloatArray) -> KnownMode:
-    moved = _pole_jacobian(dynamics, pole)
+    # dp/dd_i = -p^i / D'(p), as D(p) = 0.
+    powers = np.arange(1, len(dynamics.denominator))
+    slope = polynomial.polyval(pole, polynomial.polyder(dynamics.denominator))
+    zeros = np.zeros(len(dynamics.numerator))
+    moved = np.concatenate([zeros, -(pole**powers) / slope, [0.0]])
     size, damping = abs(pole), -pole.real / abs(pole)
     # d ln p = d ln|p| + j d arg p, and damping = -cos(arg p).
     relative = moved / pole
@@ -129,14 +133,6 @@ def _known(dynamics: TransferFunction, pole: complex, covariance: FloatArray) ->
         residue=residue,
         residue_uncertainty=None if by_residue is None else _spread(by_residue, covariance),
     )
-
-
-def _pole_jacobian(dynamics: TransferFunction, pole: complex) -> ComplexArray:
-    """Return dp/d(numerator, denominator[1:], delay), (p,); dp/dd_i = -p^i / D'(p), as D(p) = 0."""
-    powers = np.arange(1, len(dynamics.denominator))
-    slope = polynomial.polyval(pole, polynomial.polyder(dynamics.denominator))
-    zeros = np.zeros(len(dynamics.numerator))
-    return np.concatenate([zeros, -(pole**powers) / slope, [0.0]])
 
 
 def _residue(

@@ -59,7 +59,11 @@ class Recursion:
         The next sample has index 0.
         """
         for state, section in zip(self._state, self._sections, strict=True):
-            out = _polynomial_response(section, motion)
+            powers = _shifts(len(motion))
+            out = sum(b * power for b, power in zip(section[:3], powers, strict=True)) @ motion
+            if section[4:].any():  # no pure delay; long ones have hundreds of sections
+                backward = sum(a * power for a, power in zip(section[3:], powers, strict=True))
+                out = np.linalg.solve(backward, out)
             # Direct form II transposed: y = b0 x + s1; s1' = b1 x - a1 y + s2.
             b0, b1, _, _, a1, _ = section
             state[0] = out[0] - b0 * motion[0]
@@ -79,16 +83,6 @@ def through(digital: DigitalFilter, z: FloatArray) -> FloatArray:
     recursion = Recursion(digital)
     recursion.start(past_motion(z[:START_SAMPLES]))
     return recursion.run(z)
-
-
-def _polynomial_response(section: FloatArray, motion: FloatArray) -> FloatArray:
-    """Return the stationary response of a section (6,) to the polynomial ``motion``."""
-    powers = _shifts(len(motion))
-    forward = sum(b * power for b, power in zip(section[:3], powers, strict=True))
-    if not section[4:].any():  # a pure delay; long ones have hundreds of sections
-        return np.asarray(forward @ motion, np.float64)
-    backward = sum(a * power for a, power in zip(section[3:], powers, strict=True))
-    return np.asarray(np.linalg.solve(backward, forward @ motion), np.float64)
 
 
 @cache
