@@ -214,12 +214,9 @@ class SectionsProblem:
             np.concatenate([ends[1], np.full(count, longest)]),
         )
 
-    def _columns(self, nonlinear: FloatArray, order: int) -> list[_Columns]:
-        return [_Columns(self, one, nonlinear, order) for one in self.spectra]
-
     def project(self, nonlinear: FloatArray, order: int) -> Projection:
         """Return the residual after the linear parameters are eliminated."""
-        parts = self._columns(nonlinear, order)
+        parts = [_Columns(self, one, nonlinear, order) for one in self.spectra]
         grams = [part.rows @ part.rows.T - part.along @ part.along.T for part in parts]
         inverse = inverse_gram(np.sum(grams, axis=0))
         left = [part.without_free(part.one.output.copy()) for part in parts]
@@ -295,7 +292,8 @@ class SectionsProblem:
         It is the sandwich of the least squares in coloured noise, with the autocovariance of the
         residual of each record.
         """
-        parts, start = self._columns(fitted.nonlinear, fitted.order), 0
+        order, start = fitted.order, 0
+        parts = [_Columns(self, one, fitted.nonlinear, order) for one in self.spectra]
         columns = [
             part.without_free(np.concatenate([part.rows, part.slopes(fitted.linear)]))
             for part in parts

@@ -107,8 +107,15 @@ def _with_exact_ones(found: ComplexArray, count: int) -> ComplexArray:
 
 def _series(zeros: ComplexArray, poles: ComplexArray) -> _StateSpace:
     whole = _StateSpace(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
-    for numerator, denominator in _ratios(zeros, poles):
-        part = _section(numerator, denominator)
+    pairs, reals = _split(zeros)
+    of_poles, real = _split(poles)
+    # Real poles by two, the last alone where there is one more.
+    for group in [*of_poles, *(real[i : i + 2] for i in range(0, len(real), 2))]:
+        if len(group) == 2 and pairs:
+            taken = pairs.pop(0)
+        else:
+            taken, reals = reals[: len(group)], reals[len(group) :]
+        part = _section(_expanded(taken), _expanded(group))
         corner = np.zeros((len(whole.a), len(part.a)))
         whole = _StateSpace(
             np.block([[whole.a, corner], [np.outer(part.b, whole.c), part.a]]),
@@ -117,20 +124,6 @@ def _series(zeros: ComplexArray, poles: ComplexArray) -> _StateSpace:
             part.d * whole.d,
         )
     return whole
-
-
-def _ratios(zeros: ComplexArray, poles: ComplexArray) -> list[tuple[FloatArray, FloatArray]]:
-    pairs, reals = _split(zeros)
-    found = []
-    of_poles, real = _split(poles)
-    # Real poles by two, the last alone where there is one more.
-    for group in [*of_poles, *(real[i : i + 2] for i in range(0, len(real), 2))]:
-        if len(group) == 2 and pairs:
-            taken = pairs.pop(0)
-        else:
-            taken, reals = reals[: len(group)], reals[len(group) :]
-        found.append((_expanded(taken), _expanded(group)))
-    return found
 
 
 def _split(roots: ComplexArray) -> tuple[list[ComplexArray], ComplexArray]:
