@@ -207,7 +207,7 @@ def adjust(
         + looks_like(form.resembled, families, accepted, open_limit(accuracy)),
         rests_on(families, effects, form.mean_uncertainty, _mirrored(scans, surface, form)),
         enough, 2 * form.pv.uncertainty, accuracy,
-        partial(best_addition, scans, priors, surface, removed, solution.smooth_form),
+        partial(best_addition, scans, priors, surface, removed, solution),
         calibration,
         largest_contribution(made, effects, doubts, form.alike, accuracy),
     )  # fmt: skip

@@ -4,7 +4,7 @@ A design becomes a scan with few points a turn, each of which stands for many re
 equations are those of the adjustment (:mod:`network`), without heights.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -28,14 +28,14 @@ from omsm_ros.core.adjustment.figures import (
     largest_contribution,
     pv_of,
 )
-from omsm_ros.core.adjustment.network import Network, Scales, solve
+from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve
 from omsm_ros.core.adjustment.part_terms import START_POWER, part_model
 from omsm_ros.core.adjustment.refutation import completed
 from omsm_ros.core.adjustment.scan_data import ARRAYS, LEAST_POINTS, ScanData, view_of, zero_of
 from omsm_ros.core.adjustment.sources import Contribution, Source, prior_sizes
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.core.surface.aperture import BoundedSurface
+from omsm_ros.core.surface.aperture import within_aperture
 
 # Points and turns of a design: sets with more turns are planned with fewer, each counting for
 # more and the time running faster.
@@ -54,9 +54,6 @@ _RECLOCKED_RAD = np.deg2rad(80.0)
 # Share of the radius that a scan goes on beyond the axis.
 _BEYOND = 0.3
 _RANGE_M = 1e-5
-
-Form = Callable[[FloatArray, FloatArray], FloatArray]
-"""Form error [m] at x, y [m], each (n,)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,13 +114,13 @@ def posterior_uncertainty(
     priors: Sequence[Source],
     nominal: Surface,
     removed: Sequence[str] = POSE,
-    form: Form | None = None,
+    found: Solution | None = None,
     accuracy: float | None = None,
 ) -> PlannedUncertainty:
     """Return what ``designs``, adjusted together, will leave uncertain.
 
     priors: declared sources, ``noise`` [m] and ``drift_walk`` [m/√s] among them
-    form: form error of the part [m]; None: not known;  accuracy: asked for, k = 2 [m], or None
+    found: by scans of this part, else that of good ones;  accuracy: asked for, k = 2 [m], or None
     """
     scans, begin = [], 0.0
     shorter = max(1.0, max(d.turns for d in designs) / _MOST_TURNS)
@@ -138,18 +135,22 @@ def posterior_uncertainty(
     # All is over sooner by ``shorter``: what grows with time has to grow faster.
     sizes["drift_rate"] *= shorter
     stated = {p.name: p.uncertainty for p in priors}
-    noise = stated.get("noise", _NOISE_M)
+    noise, walk = stated.get("noise", _NOISE_M), stated.get("drift_walk", _WALK_M) ** 2
+    cells, bands = _CELLS_M**2, dict[int, float]()
+    if found is not None:
+        noise, walk = float(np.mean(found.network.blocks.noise)), found.scales.walk
+        cells, bands = found.scales.cells, dict(found.scales.bands)
     blocks = blocks_of(views, [s.weight for s in scans], families, noise)
     part = part_model(blocks, min(s.turns for s in scans), _DEGREE)
     scales = Scales(
-        walk=stated.get("drift_walk", _WALK_M) ** 2 * shorter,
-        bands=dict.fromkeys(map(int, part.degrees), _BAND_M**2),
-        cells=_CELLS_M**2,
+        walk=walk * shorter,
+        bands={int(d): bands.get(int(d), _BAND_M**2) for d in part.degrees},
+        cells=cells,
         noise=np.ones(len(scans)),
     )
     solution = solve(Network(blocks, families, part), np.zeros(len(blocks)), scales, sizes)
     made = FormOf.of(completed(solution), nominal, removed)
-    pv, height = _of_pv(made, form)
+    pv, height = _of_pv(made, found)
     effects = {} if accuracy is None else effects_on_form(made)
     return PlannedUncertainty(
         pv=pv,
@@ -159,16 +160,16 @@ def posterior_uncertainty(
     )
 
 
-def _of_pv(made: FormOf, form: Form | None) -> tuple[float, FloatArray]:
-    """Return the standard uncertainty of PV of ``form``, or what ``_SHARE`` of all reach [m], and
-    the form that has it (n,) [m]."""
+def _of_pv(made: FormOf, known: Solution | None) -> tuple[float, FloatArray]:
+    """Return the standard uncertainty of PV of the ``known`` form, or that ``_SHARE`` of all reach
+    [m], and the form that has it (n,) [m]."""
     part, places = made.solution.network.part, made.places
     sizes = np.array([t.n ** (-START_POWER / 2) if t.n > 1 else 0.0 for t in part.terms])
     terms = part.values(places.x, places.y)[:, : len(sizes)] * sizes
     forms = made.free(terms @ np.random.default_rng(0).standard_normal((len(sizes), _FORMS)))
     forms *= _FORM_M / np.sqrt(places.area @ forms**2)
-    if form is not None:
-        forms = made.free(form(places.x, places.y)[:, np.newaxis])
+    if known is not None:
+        forms = made.free(known.smooth_form(places.x, places.y)[:, np.newaxis])
     errors = made.free(made.errors()[0])
     found = np.array([figure(f, errors, pv_of).uncertainty for f in forms.T])
     reached = float(np.quantile(found, _SHARE))
@@ -270,9 +271,8 @@ def design_scan(design: ScanDesign, nominal: Surface, begin: float, shown: float
     part = chuck * np.exp(-1j * design.clocking)
     motion = nominal.height(part.real, part.imag)
     # Off the part the probe sees nothing.
-    seen = np.ones(number, bool)
-    if isinstance(nominal, BoundedSurface):
-        seen = nominal.aperture.holds(part.real, part.imag)
+    area = within_aperture(nominal, None)[1]
+    seen = np.ones(number, bool) if area is None else area.holds(part.real, part.imag)
     # The probe is driven through some of its range on the way, else its scale would not show.
     distance = _RANGE_M * np.sin(2 * np.pi * 7 * share)
     channels = (begin + time, chuck.real, chuck.imag, motion, distance, motion, np.zeros(number), c)
@@ -289,12 +289,12 @@ def best_addition(
     priors: Sequence[Source],
     nominal: Surface,
     removed: Sequence[str],
-    form: Form,
+    found: Solution | None = None,
 ) -> tuple[str, float]:
     """Return the code of the scan to add that helps most, and U (k = 2) of PV with it [m]."""
     designs = [design_of(scan) for scan in scans]
     reached = {
-        code: 2 * posterior_uncertainty([*designs, added], priors, nominal, removed, form).pv
+        code: 2 * posterior_uncertainty([*designs, added], priors, nominal, removed, found).pv
         for code, added in additions(designs[0]).items()
         if code != REPEATED_TRACK  # leaves the set without redundancy
     }

@@ -116,10 +116,10 @@ def test_a_design_goes_beyond_the_centre_as_its_scan_does():
 def test_the_best_addition_is_the_best_of_all():
     machine = Machine(1)
     scan = machine.scan(30)
-    code, reached = best_addition([scan], PRIORS, MIRROR, POSE, form)
+    code, reached = best_addition([scan], PRIORS, MIRROR, POSE)
     first = design_of(scan)
-    alone = posterior_uncertainty([first], PRIORS, MIRROR, POSE, form).pv
+    alone = posterior_uncertainty([first], PRIORS, MIRROR, POSE).pv
     for added in additions(first).values():
-        assert reached <= 2 * posterior_uncertainty([first, added], PRIORS, MIRROR, POSE, form).pv
+        assert reached <= 2 * posterior_uncertainty([first, added], PRIORS, MIRROR, POSE).pv
     assert reached < 0.3 * 2 * alone
     assert code != "repeated_track"
