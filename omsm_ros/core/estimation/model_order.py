@@ -29,7 +29,7 @@ from omsm_ros.core.lti.transfer_function import (
 )
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import IdentificationError
-from omsm_ros.linear_algebra import least_squares
+from omsm_ros.linear_algebra import inverse_gram
 
 # Most poles of the free choice; real machines have needed four in the band of a step test.
 _FREE_POLES = 8
@@ -274,9 +274,9 @@ class StartingPoints:
         for _ in range(_LINEAR_ITERATIONS):
             weight = 1 / np.abs(np.prod(1 - s / poles, axis=1))
             columns = every * weight[:, np.newaxis]
-            columns = np.concatenate([columns.real, columns.imag])
-            target = np.concatenate([(probe * weight).real, (probe * weight).imag])
-            solved = least_squares(columns, target)
+            # Products of columns suffice for a start.
+            gram, moment = columns.conj().T @ columns, columns.conj().T @ (probe * weight)
+            solved = inverse_gram(gram.real) @ moment.real
             denominator = np.concatenate([np.ones(1), solved[: structure.poles]])
             found = _stable(ascending_roots(denominator))
             if len(found) != structure.poles:
