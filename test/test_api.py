@@ -1,6 +1,7 @@
 """The Python interface: arrays in, results out, the same numbers as the commands."""
 
 import doctest
+import inspect
 import subprocess
 import sys
 
@@ -218,7 +219,7 @@ def test_the_examples_of_the_functions_run(results, monkeypatch, tmp_path):
         ran = doctest.DocTestRunner().run(found)
         assert (ran.attempted, ran.failed) == (len(found.examples), 0), name
     for name in functions:
-        assert "    Parameters\n    ----------\n" in getattr(omsm, name).__doc__
+        assert "\nParameters\n----------\n" in inspect.getdoc(getattr(omsm, name))
 
 
 def test_a_plan_is_the_motion_of_its_program(results):
