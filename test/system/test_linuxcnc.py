@@ -85,10 +85,16 @@ def test_the_commands_of_the_page_make_true_points(cell, true_calibration):
     design = ScanDesign(rpm=60.0, start=2e-3, end=1e-3, pitch=2e-4)
     write_scans([design], PAPER_MIRROR, cell.folder / "plan", 1e-7, 1e-3)
     clouds = cell.clouds()
-    # The nodes of a workspace of wheels are found by name.
-    shell = ["bash", "-c", 'ros2() { shift 2; "$@"; }\n' + commands]
-    with subprocess.Popen(shell, cwd=cell.folder, start_new_session=True) as page:
+    # The nodes of a workspace of wheels are found by name. On a busy computer they start slowly, so
+    # the machine waits for them, as its operator does.
+    nodes, moves = commands.split("python", 1)
+    shell = ["bash", "-c", f'ros2() {{ shift 2; "$@"; }}\n{nodes}read\npython{moves}']
+    value, given = cell.operator.value, {"cwd": cell.folder, "stdin": subprocess.PIPE}
+    with subprocess.Popen(shell, start_new_session=True, **given) as page:
         try:
+            cell.wait("a listener", lambda: value("confocal_driver", "axes_subscribers") >= 1)
+            page.stdin.write(b"\n")
+            page.stdin.flush()
             cell.wait("the end of the scan", lambda: page.poll() is not None)
             cell.settle("corrector", "axes_corrected")
         finally:
