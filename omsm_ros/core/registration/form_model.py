@@ -36,6 +36,9 @@ _LEAST_NEW = 1e-4
 # Turning makes rings, so rotationally symmetric terms from the fourth order on have their own σ.
 _RINGS = HIGHEST_ORDER + 1
 _GROUPS = np.array([_RINGS if t.m == 0 and t.n > 2 else t.n for t in _TERMS])
+# Terms of an order are equally high in rms, as on isotropic form, or at the rim, where rotational
+# ones have √2 times the rms: the middle of both variances.
+_USUAL = np.array([1.0 if term.m else 1.5**0.5 for term in _TERMS])
 # Relative change of the variances at convergence; parts need 8 to 40 iterations.
 _TURNS, _SETTLED = 300, 1e-3
 # Amplitudes of optical figure errors fall with the second to fourth power of their order (±1).
@@ -72,7 +75,7 @@ GROUP = 128
 
 @dataclass(frozen=True, eq=False)
 class FormBasis:
-    """Polynomials of orders 2 to 8, orthonormal over the area and to piston and tilts.
+    """Polynomials of orders 2 to 8, orthogonal over the area and to piston and tilts.
 
     On a disc these are Zernike's; elsewhere they are made of Zernike's in their order.
 
@@ -93,7 +96,7 @@ class FormBasis:
         values = zernike_values(*disc.scaled(x, y), _TERMS) * _SCALE[:, np.newaxis]
         gram = (values * (area / area.sum())) @ values.T
         rows: list[FloatArray] = []
-        groups: list[int] = []
+        kept: list[int] = []
         for place, row in enumerate(np.eye(len(_TERMS))):
             for _ in range(2):  # the second pass removes rounding errors of the first
                 for other in rows:
@@ -101,17 +104,18 @@ class FormBasis:
             new = float(row @ gram @ row)
             if new > _LEAST_NEW**2 * gram[place, place]:
                 rows.append(row / np.sqrt(new))
-                groups.append(int(_GROUPS[place]))
-        form = np.array(groups) >= 2
+                kept.append(place)
+        form = _GROUPS[kept] >= 2
         if not np.any(form):
             raise DataError("registration.no_form")
-        return cls(disc, np.array(rows)[form] * _SCALE, np.array(groups)[form])
+        mix = np.array(rows) * _USUAL[kept, np.newaxis] * _SCALE
+        return cls(disc, mix[form], _GROUPS[kept][form])
 
     def __len__(self) -> int:
         return len(self.group)
 
     def columns(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the polynomials (k, n) at x, y (n,) [m], each with an rms of one over the area."""
+        """Return the polynomials (k, n) at x, y (n,) [m], with their usual rms over the area."""
         return np.asarray(self.mix @ zernike_values(*self.disc.scaled(x, y), _TERMS), np.float64)
 
 
