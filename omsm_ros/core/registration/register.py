@@ -19,6 +19,7 @@ from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.form_model import (
     LEAST_LIMIT_M,
     NOT_SETTLED,
+    OUTLIER_SIGMAS,
     Estimate,
     FormBasis,
     FormNormalEquations,
@@ -230,25 +231,29 @@ def _useful(
     open_: OpenUncertainty,
 ) -> tuple[_PoseFit, _PlacementState, OpenUncertainty]:
     """Hold the moves that were not asked for by name and that the points hardly determine."""
-    names, at = fit.dofs.fitted, stand.at
-    values = np.array([at.value(name) for name in names])
-    covariance = stand.found.covariance[: len(names), : len(names)]
+    first, names = stand, fit.dofs.fitted
     while True:
-        free = len(fit.dofs.fitted)
-        weak = weakest_dof(
-            fit.dofs,
-            asked,
-            np.array([stand.at.value(n) for n in fit.dofs.fitted]),
-            stand.found.covariance[:free, :free],
-            stand.sums.gram[:free, :free] / stand.sums.points,
-        )
-        if weak is None:
+        fitted, free = fit.dofs.fitted, len(fit.dofs.fitted)
+        values = np.array([stand.at.value(n) for n in fitted])
+        covariance = stand.found.covariance[:free, :free]
+        gram = stand.sums.gram[:free, :free] / stand.sums.points
+        if (weak := weakest_dof(fit.dofs, asked, values, covariance, gram)) is None:
             break
-        fit = replace(fit, dofs=fit.dofs.without(*weak))
+        less = replace(fit, dofs=fit.dofs.without(*weak))
         back = stand.at.moved([weak[0]], np.array([-stand.at.value(weak[0])]))
-        stand = fit.refine(
-            coarse_placement(fit.surface, chosen, fit.dofs.fitted, fit.aperture, back), chosen
-        )
+        try:
+            back = coarse_placement(fit.surface, chosen, less.dofs.fitted, fit.aperture, back)
+            fixed = less.refine(back, chosen)
+        except DataError:
+            break
+        # A nominal value that the points contradict takes what is asked for far away.
+        away = np.abs([fixed.at.value(n) for n in fitted] - values)
+        beyond = away > OUTLIER_SIGMAS * np.sqrt(np.diag(covariance))
+        if np.any(beyond & np.isin(fitted, asked)):
+            break
+        fit, stand = less, fixed
+    values = np.array([first.at.value(name) for name in names])
+    covariance = first.found.covariance[: len(names), : len(names)]
     held = [names.index(n) for n in fit.dofs.held]
     square = covariance[np.ix_(held, held)] + np.outer(values[held], values[held])
     most = np.array([fit.dofs.declared.get(n, np.inf) for n in fit.dofs.held])

@@ -5,13 +5,13 @@ import pytest
 from soaked import soaked
 
 from omsm_ros.core.form.analyse import analyse_form
-from omsm_ros.core.registration.placement import PointBatch
+from omsm_ros.core.registration.placement import Placement, PointBatch
 from omsm_ros.core.registration.register import register
 from omsm_ros.core.surface.aspheres import Asphere, Sphere, Toroid
 from omsm_ros.core.surface.nominal import Flat, OffAxisParaboloid
 from omsm_ros.core.surface.posed import Pose, PosedSurface
 from omsm_ros.core.surface.shape_parameters import external
-from omsm_ros.core.surface.zernike_terms import ZernikeIndex
+from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 from omsm_ros.errors import ConfigurationError
 
 R, N = 12e-3, 2000
@@ -146,3 +146,22 @@ def test_a_profile_has_a_radius_however_flat_and_with_few_points(count, radius):
     assert abs(curvature - 1 / radius) < 2 * found.spread["radius"] < 1e-5
     flat = register(Flat(), lambda: [batch], ("auto",))
     assert "clocking" in flat.dofs.refused
+
+
+def test_a_place_that_the_points_contradict_is_not_held_at_its_nominal_one():
+    """A fast off-axis paraboloid, 0.15 mm off along y and 0.3 mm along x, with 100 nm of form."""
+    random, radius, focal = np.random.default_rng(39), 6e-3, 11.3e-3
+    x, y = (v.ravel() for v in np.meshgrid(*[np.linspace(-radius, radius, 100)] * 2))
+    x, y = (v[np.hypot(x, y) <= radius] for v in (x, y))
+    terms = terms_up_to(8, 2)
+    amplitudes = random.normal(size=len(terms)) * [term.n**-2.5 for term in terms]
+    form = amplitudes @ zernike_values(x / radius, y / radius, terms)
+    places = np.array([-3e-4, -1.5e-4, 2.2e-3, -2e-3]) * random.choice([-1, 1], 4)
+    pose = Placement().moved(("x", "y", "tip", "tilt"), places).pose
+    height = PosedSurface(OffAxisParaboloid(focal, 10.2e-3), pose).height(x, y)
+    height += 100e-9 * form / form.std() + random.normal(0, 5e-9, len(x))
+    points = PointBatch(x, y, height, np.empty((0, len(x))))
+    asked = ("auto", "parent_focal_length")
+    found = register(OffAxisParaboloid(50e-3, 10.2e-3), lambda: [points], asked, even=True)
+    error = found.placement.value("parent_focal_length") - 1 / focal
+    assert abs(error) < 2 * found.spread["parent_focal_length"] < 0.02 / focal
