@@ -229,10 +229,9 @@ class _Gaps(NamedTuple):
         places = (x[near] - rim[0]) + 1j * (y[near] - rim[1])
         parabola, plane = continued(places / spacing)
         weights = np.stack([parabola, (parabola - plane) / 2])
-        strip = None
-        if outline.outline != "annulus":
-            every = np.stack([map_.x, map_.y]), map_.area / map_.area.sum(), outline, spacing
-            strip = RimStrip.of(*every, lambda x, _: np.ones((1, len(x))))
+        every = np.stack([map_.x, map_.y]), map_.area / map_.area.sum(), outline, spacing
+        strip = RimStrip.of(*every, lambda x, _: np.ones((1, len(x))))
+        strip = None if outline.outline == "annulus" else strip
         share = float(way[-1]) * spacing / abs(float(np.sum(u[:-1] * v[1:] - u[1:] * v[:-1])))
         return cls(map_.x, map_.y, spacing, some[near], weights, strip, share)
 

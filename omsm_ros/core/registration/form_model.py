@@ -15,7 +15,7 @@ one-sided 85 % bound is used. Points far from any sum of the columns are outlier
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -119,7 +119,6 @@ class FormBasis:
         return np.asarray(self.mix @ zernike_values(*self.disc.scaled(x, y), _TERMS), np.float64)
 
 
-@dataclass(eq=False)
 class FormNormalEquations:
     """Products of columns with each other, the deviation and ``sources`` systematic effects.
 
@@ -129,17 +128,10 @@ class FormNormalEquations:
         products with the residual, which shows correlated errors
     """
 
-    columns: int
-    sources: int
-    points: int = 0
-    square: float = 0.0
-    total: float = 0.0
-    gram: FloatArray = field(init=False)
-    scores: FloatArray = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.gram = np.zeros((self.columns, self.columns + 1 + self.sources))
-        self.scores = np.zeros(self.columns)
+    def __init__(self, columns: int, sources: int) -> None:
+        self.columns, self.points = columns, 0
+        self.square = self.total = 0.0
+        self.gram, self.scores = np.zeros((columns, columns + 1 + sources)), np.zeros(columns)
 
     def add(self, columns: FloatArray, deviation: FloatArray, systematic: FloatArray,
             residual: FloatArray, near: BoolArray | None = None,
