@@ -250,7 +250,8 @@ class _Gaps(NamedTuple):
         chance = 2 * np.sqrt(np.sum((weights * part.error[self.near]) ** 2, axis=1))
         for sign, unseen in zip((-1, 1), part.unseen, strict=True):
             values = sign * form
-            at_rim = float(np.max(sign * (rim + further) - chance, initial=-np.inf))
+            more = np.maximum(sign * further, 0.0)  # Form that flattens ends where it is.
+            at_rim = float(np.max(sign * rim + more - chance, initial=-np.inf))
             summit = self._summit(values + unseen, sign * part.above + unseen, part.error)
             found.append(max(summit, at_rim) - float(values.max()))
             alone.append(self._alone(values))

@@ -85,6 +85,25 @@ def test_a_rolled_edge_beyond_the_last_whole_turn_belongs_to_the_figures(turns):
         assert rms.uncertainty < 0.016 * true
 
 
+def test_an_edge_that_flattens_towards_the_rim_is_continued_to_it():
+    """The edge is Gaussian, and lowest where the last track is most of a track within the rim."""
+
+    def form(r, angle):
+        return -300e-9 * np.exp(-(((r - 1) / 0.26) ** 2)) - 40e-9 * r**3 * np.cos(angle - 0.35)
+
+    for seed in range(3):
+        share, turns = np.linspace(1, 1e-3, 10_000), 45
+        turn = 2 * np.pi * turns * share
+        x, y = (R * share * f(turn) for f in (np.cos, np.sin))
+        noise, outline = np.random.default_rng(seed).normal(0, 0.5e-9, len(x)), Aperture(R)
+        map_ = DeviationMap(x=x, y=y, deviation=form(share, turn) + noise, noise=0.5e-9,
+                            area=area_weights(x, y, outline=outline),
+                            effects=np.empty((0, len(x))))  # fmt: skip
+        whole = extents_of_parts([map_], outline, outline, R / turns)[0][0]
+        true = np.ptp(form(*np.meshgrid(np.linspace(0, 1, 400), np.linspace(0, 2 * np.pi, 400))))
+        assert abs(whole.value - true) < 2 * whole.uncertainty < 12e-9
+
+
 @pytest.mark.parametrize("missing", [0.0, 0.25])
 def test_the_rms_is_of_the_covered_part_of_the_rim(missing):
     """Astigmatism of 100 nm at the rim has a mean square of (100 nm)² / 6 on any such sector.
