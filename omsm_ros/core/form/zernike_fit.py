@@ -223,9 +223,8 @@ class RimStrip(NamedTuple):
         nearest = cKDTree((rim + middle).T).query(near_rim.T)[1]
         own = weights[points] * known[nearest]
         # The points stand for the covered part of the outline only.
-        area = triangles * known / max(float(np.sum(triangles[known])), 1e-300)
-        area *= np.sum(own) / (1 - (1 - 2 * depth) ** 2)
-        area = np.outer(area, shares).ravel()
+        covered = max(float(np.sum(triangles[known])), 1e-300) * (1 - (1 - 2 * depth) ** 2)
+        area = np.outer(triangles * known * np.sum(own) / covered, shares).ravel()
         begins = np.arange(len(area) + 1) * _AROUND
         sums = columns(*near_rim) * own * _fading((1 - size[points]) / depth)
         parabola, plane = np.zeros((2, *sums.shape))
