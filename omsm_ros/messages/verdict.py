@@ -41,11 +41,12 @@ verdict.shrink: the largest contribution is {name}: its standard uncertainty of 
     to shrink to {allowed}
 verdict.remain: the largest contribution is {name}, standard uncertainty {size}; without it the
     expanded uncertainty would still be {rest:m/2}
-verdict.add_other_speed: scan the part again at twice the speed, from the centre outward
+verdict.add_other_speed: scan the part again at twice the speed, with X in the other direction
 verdict.add_other_direction: scan the part again with the spindle reversed
 verdict.add_reclocked: turn the part on the chuck by 80°, and scan it again at twice the speed
 verdict.add_repeated_track: scan the part again in the same way
-verdict.add_beyond_centre: scan the part again at twice the speed, from beyond the centre outward
+verdict.add_beyond_centre: scan the part again at twice the speed, with X in the other direction and
+    beyond the centre by 0.3 of the radius
 verdict.add_other_stand_off: scan the part again at another stand-off of the probe
 verdict.add_reference_artefact: measure a reference artefact
 """)

@@ -160,7 +160,7 @@ def test_a_verdict_says_what_would_verify_each_source_it_rests_on():
     _, scan, artefact = text.split(". ")
     assert scan == (
         "To verify squareness of X to the spindle, spindle centre in x, scan the part again at "
-        "twice the speed, from beyond the centre outward"
+        "twice the speed, with X in the other direction and beyond the centre by 0.3 of the radius"
     )
     assert artefact.endswith("measure a reference artefact")
 

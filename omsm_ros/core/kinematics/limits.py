@@ -29,7 +29,6 @@ _PRECISION = 1e-4
 # Least ratio of a value to its limit, because zero has no logarithm.
 _TINY = 1e-12
 
-
 # Plausible ranges: a value in another unit, as 100 for micrometres, is refused.
 _FREQUENCY = Quantity("limit", "Hz", 1e-3, 1e6, "give it in hertz")
 _LENGTH = Quantity("limit", "m", 1e-10, 1.0, "give it in metres")
