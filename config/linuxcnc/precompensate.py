@@ -121,7 +121,8 @@ def servo(command, encoder):
         prior = decay**later
         if smooth:
             prior = decay ** (np.add.outer(place, place) + later) / 2 - decay ** (3 * later) / 6
-        root = cholesky(size * prior + 1e-15 * np.eye(count), lower=True)
+        share, axes = np.linalg.eigh(size * prior)
+        root = axes * np.sqrt(np.maximum(share, 0.0))  # smallest shares are rounding
         inner = root.T @ square @ root / noise**2 + np.eye(count)
         found = np.linalg.solve(inner, root.T @ seen / noise**2)
         evidence = seen @ root @ found / noise**2 - np.linalg.slogdet(inner)[1]

@@ -4,6 +4,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent import futures
 from concurrent.futures import Future
 from enum import Enum
 from typing import Any
@@ -72,7 +73,7 @@ class DeviceReader:
         self._requests.put((request, done))
         try:
             return done.result(patience)
-        except TimeoutError as err:
+        except futures.TimeoutError as err:  # another one than the built-in of Python 3.10
             if not done.cancel() and done.done():
                 raise  # the device did not answer
             raise DeviceError(f"the device did not do it within {patience:g} s") from err

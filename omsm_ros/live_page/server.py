@@ -210,7 +210,7 @@ class LiveServer:
 
     def _tell(self, connection: ServerConnection) -> None:
         generation, version, turn = -1, 0, 0
-        while True:
+        while self._server is not None:
             if turn % _STATES_EVERY == 0:
                 state = json_and_yaml.unknown_as_null(self._view.state())
                 connection.send(json_and_yaml.text_of(state))
@@ -261,9 +261,9 @@ def _serve(server: Server) -> None:
     try:
         server.serve_forever()
     finally:
-        # websockets does neither if it ends before it has begun.
-        server.socket_closed.set()
-        server.shutdown_watcher.close()
+        if hasattr(server, "socket_closed"):  # since 17, which does neither before it has begun
+            server.socket_closed.set()
+            server.shutdown_watcher.close()
 
 
 _COLOURS = 128

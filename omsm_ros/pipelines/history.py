@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import time
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -49,7 +48,8 @@ class Catalogue:
     def __init__(self, address: str) -> None:
         self.address = address if "://" in address else f"{_SQLITE}{address}"
         kind = self.address.partition("://")[0]
-        if kind not in _KINDS or address.encode(errors="replace").decode() != address:
+        encoded = address.encode(errors="replace").decode() == address
+        if kind not in _KINDS or not encoded or (kind == "sqlite" and "?" in address):
             raise ConfigurationError(
                 f"catalogue {shown(address)}, expected a file, sqlite:///FILE or postgresql://…, "
                 "in UTF-8"
@@ -73,9 +73,7 @@ class Catalogue:
                 "-c client_encoding=UTF8"  # without it a base returns bytes
             )
         self._tables = _tables(sqlalchemy)
-        with self._translated(), warnings.catch_warnings():
-            # An unknown part of the address is an error.
-            warnings.simplefilter("error", sqlalchemy.exc.SAWarning)
+        with self._translated():
             # No pool: a command adds one row and ends.
             self._engine = sqlalchemy.create_engine(
                 self.address, connect_args=waiting, poolclass=sqlalchemy.pool.NullPool

@@ -57,9 +57,12 @@ def test_an_address_that_is_no_text_is_refused():
         Catalogue("a\udcff.sqlite")
 
 
-@pytest.mark.parametrize(
-    "address", ["a\0b", "postgresql://u:secret@[::1", "sqlite:///a.sqlite?mode=ro"]
-)
+def test_a_part_of_an_address_that_says_nothing_is_refused():
+    with pytest.raises(ConfigurationError, match=r"mode=ro', expected a file, sqlite:///FILE"):
+        Catalogue("sqlite:///a.sqlite?mode=ro")
+
+
+@pytest.mark.parametrize("address", ["a\0b", "postgresql://u:secret@[::1"])
 def test_an_address_that_is_none_is_named_without_its_password(address):
     with pytest.raises(FileError, match="check that it is there") as refusal, Catalogue(address):
         pass

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("websockets", reason="websockets is an optional package")
+import websockets
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.sync.server import Server
@@ -216,6 +217,8 @@ def answer_to(server, request):
 def test_a_foolish_request_is_refused_without_a_traceback(
     serve, caplog, request_line, more, status
 ):
+    if status == 405 and websockets.__version__ < "17":
+        pytest.skip("websockets answers no other method before 17")
     reported = answer_to(serve(), f"{request_line} HTTP/1.1\r\n{more}\r\n\r\n".encode())
     assert reported.startswith(f"HTTP/1.1 {status} ")
     assert not caplog.records
