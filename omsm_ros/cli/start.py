@@ -7,7 +7,7 @@ from omsm_ros.cli.command import CliCommand, Facts, say, say_lines
 from omsm_ros.core.adjustment.source_evaluation import PASSES, SPHERE, STAND_OFFS, STILL, TURNED
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.pipelines.record_bags import record_sources, record_twin
-from omsm_ros.quantities import FEED, RADIUS, SEED, SPEED
+from omsm_ros.quantities import FEED, LENGTH, RADIUS, SEED, SPEED
 from omsm_ros.twin.scenario import Scenario
 
 
@@ -20,6 +20,7 @@ def _declare_twin(add: Arguments) -> None:
     add("--disturbances", "FILE", "errors of the machine")
     add("--seed", SEED, "seed of noise and part", default=1)
     add("--outward", None, "scan from the centre outward")
+    add("--beyond", LENGTH, "way of X on the other side of the centre [m]", default=0.0)
     add("--recordings", str, nargs="*", choices=(SPHERE, STILL, TURNED, PASSES, STAND_OFFS))
     add("--part", SEED, "seed of the part alone, for several scans of one part")
 
@@ -32,6 +33,7 @@ def _twin(args: argparse.Namespace) -> Facts:
         start_radius=args.radius,
         part_seed=args.part,
         outward=args.outward,
+        beyond=args.beyond,
     )
     if args.recordings is not None:
         kinds = args.recordings or (SPHERE, STILL, TURNED, PASSES, STAND_OFFS)

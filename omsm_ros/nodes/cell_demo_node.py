@@ -250,7 +250,7 @@ def perform(
     with stage("starting the recorder of the second scan"):
         processes.end("recorder")
         _record(node, processes, plan, plan.second_bag)
-    with stage(f"outward at twice the speed: {second} points", second) as progress:
+    with stage(f"at twice the speed from beyond the centre: {second} points", second) as progress:
         _scan(node, plan, "verifying_scan", second, progress)
     if plan.view:
         node.show("both scans are recorded and are being adjusted together")

@@ -73,7 +73,7 @@ class CellEmulatorNode(ManagedNode):
     An ``accelerometer`` among the disturbances is published on ``acceleration``.
 
     Services: ``~/step_test``, ``~/scan``, ``~/verifying_scan`` (std_srvs/Trigger; the last one
-    scans the part outward at twice the speed) answer as soon as the motion starts; ``~/stop``
+    scans from beyond the centre at twice the speed) answer as soon as the motion starts; ``~/stop``
     ends it. The action ``~/scan`` ends with the motion, and stops it when it is cancelled.
     """
 

@@ -97,7 +97,7 @@ class Demonstration:
     view: show the scan in a browser
 
     The calibrator node writes ``calibration_file``, the recorder node ``bag`` and ``second_bag``:
-    the second scan runs outward at twice the speed; ``nominal_file`` has the mirror's surface.
+    the second scan is from beyond the centre at twice the speed; ``nominal_file`` has the surface.
     """
 
     out: Path

@@ -43,7 +43,7 @@ class Scenario:
     seed: of all random numbers;  part_seed: of the figure error, None takes ``seed``
     spindle_speed: [rpm];  feed_per_turn, start_radius: [m];  step_rise, sample_period: [s]
     tool_marks: peak to valley of the marks of the turning tool [m]
-    outward: scan from the centre outward
+    outward: scan from the centre outward;  beyond: way of X on its other side [m]
     """
 
     seed: int = 1
@@ -55,6 +55,7 @@ class Scenario:
     part_seed: int | None = None
     tool_marks: float = 0.0
     outward: bool = False
+    beyond: float = 0.0
 
     @property
     def part(self) -> FigureError:
@@ -118,17 +119,19 @@ def spiral_of(scenario: Scenario) -> Spiral:
         scenario.feed_per_turn,
         scenario.spindle_speed,
         scenario.outward,
+        scenario.beyond,
     )
 
 
 def verifying(scenario: Scenario) -> Scenario:
-    """Return the scan that verifies ``scenario``: the same part outward at twice the speed."""
+    """Return the scan that verifies ``scenario``: at twice the speed from beyond the centre."""
     return replace(
         scenario,
         seed=scenario.seed + 1,
         part_seed=scenario.seed if scenario.part_seed is None else scenario.part_seed,
         spindle_speed=2 * scenario.spindle_speed,
         outward=not scenario.outward,
+        beyond=0.3 * scenario.start_radius,
     )
 
 

@@ -122,13 +122,15 @@ def speed_limits(
     velocity, acceleration, jerk = steepest(path.z, path.sample_period, content)
     exposed = None if limits.exposure is None else limits.exposure**2 / 24 * acceleration
     late = None if limits.timing is None else limits.timing * velocity
+    duration = (len(path.z) - 1) * path.sample_period
+    rpm = None if path.c is None else float(abs(path.c[-1] - path.c[0])) / duration / RPM_RAD_S
     every = (
         _power("calibrated band", content, valid_up_to, "Hz", 1),
         _power("motion frequency", content, limits.motion_frequency, "Hz", 1),
         _following(path, limits, dynamics),
         _power("Z acceleration", acceleration, limits.z_acceleration, "m/s²", 2),
         _power("Z jerk", jerk, limits.z_jerk, "m/s³", 3),
-        _power("spindle speed", _spindle_rpm(path), limits.spindle_speed_rpm, "rpm", 1),
+        _power("spindle speed", rpm, limits.spindle_speed_rpm, "rpm", 1),
         _power("spacing at the rim", _spacing(path), limits.point_spacing, "m", 1),
         _power("path within one exposure", exposed, budget / 2, "m", 2),
         _power("timing of the trigger", late, budget / 2, "m", 1),
@@ -191,12 +193,6 @@ def _following(
     value, allowed = share * now + taken, limits.probe_range / 2
     factor = highest_factor(lambda k: share * excursion(k) + taken, allowed, value)
     return SpeedLimit(name, value, allowed, "m", factor)
-
-
-def _spindle_rpm(path: ScanPath) -> float | None:
-    if path.c is None:
-        return None
-    return float(abs(path.c[-1] - path.c[0]) / ((len(path.c) - 1) * path.sample_period) / RPM_RAD_S)
 
 
 def _spacing(path: ScanPath) -> float | None:

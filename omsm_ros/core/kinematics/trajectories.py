@@ -62,7 +62,7 @@ class Spiral:
     """X feeds from ``start_radius`` to the centre while C turns and Z follows ``surface``.
 
     start_radius: [m];  feed_per_turn: [m];  spindle_speed: [rpm], negative reverses.
-    outward: from the centre to ``start_radius`` instead.
+    outward: to ``start_radius`` instead;  beyond: way of X on the other side of the centre [m]
     Before its start the motion is a circle at the start radius.
     """
 
@@ -71,6 +71,7 @@ class Spiral:
     feed_per_turn: float
     spindle_speed: float
     outward: bool = False
+    beyond: float = 0.0
 
     def __post_init__(self) -> None:
         if self.start_radius <= 0 or self.feed_per_turn <= 0 or self.spindle_speed == 0:
@@ -80,20 +81,19 @@ class Spiral:
                 feed=self.feed_per_turn,
                 speed=self.spindle_speed,
             )
-        if self.feed_per_turn > self.start_radius:
-            raise ConfigurationError(
-                "kinematics.feed", feed=self.feed_per_turn, radius=self.start_radius
-            )
+        if self.feed_per_turn > (way := self.start_radius + self.beyond):
+            raise ConfigurationError("kinematics.feed", feed=self.feed_per_turn, radius=way)
 
     @property
     def duration(self) -> float:
         """Time that the feed takes [s]."""
-        return self.start_radius / (self.feed_per_turn * abs(self.spindle_speed) * RPM_HZ)
+        way = self.start_radius + self.beyond
+        return way / (self.feed_per_turn * abs(self.spindle_speed) * RPM_HZ)
 
     def positions(self, time: FloatArray) -> AxisPositions:
         """Return the commanded axes at ``time`` [s]."""
         feed = self.feed_per_turn * abs(self.spindle_speed) * RPM_HZ * np.maximum(time, 0.0)
-        x = feed if self.outward else self.start_radius - feed
+        x = feed - self.beyond if self.outward else self.start_radius - feed
         return _on_surface(self.surface, x, self.spindle_speed * RPM_RAD_S * time)
 
 

@@ -89,7 +89,12 @@ def test_a_sharp_edge_is_there_from_its_first_moment_on():
 @pytest.mark.parametrize("speed", [30.0, -45.0])
 @pytest.mark.parametrize("surface", [PAPER_MIRROR, Toroid(0.05, -0.04)])
 @pytest.mark.parametrize(
-    "make", [lambda s, v: Spiral(s, 5e-3, 1e-3, v), lambda s, v: Circle(s, 4e-3, v, turns=2.5)]
+    "make",
+    [
+        lambda s, v: Spiral(s, 5e-3, 1e-3, v),
+        lambda s, v: Spiral(s, 5e-3, 1e-3, v, outward=True, beyond=2e-3),
+        lambda s, v: Circle(s, 4e-3, v, turns=2.5),
+    ],
 )
 def test_a_probe_on_the_axis_of_its_spindle_sees_the_surface_all_the_way(make, surface, speed):
     """Through the kinematics that turn positions of axes into points."""
@@ -109,6 +114,13 @@ def test_each_turn_of_a_spiral_is_a_feed_nearer(speed):
     np.testing.assert_allclose(-np.diff(axes.x), np.full(16, 5e-4), rtol=1e-9)
     np.testing.assert_allclose(np.diff(axes.c), np.full(16, np.copysign(2 * np.pi, speed)))
     assert spiral.duration == pytest.approx(16 * turn)
+
+
+@pytest.mark.parametrize(("outward", "ends"), [(False, (8e-3, -2e-3)), (True, (-2e-3, 8e-3))])
+def test_a_spiral_goes_on_beyond_the_centre(outward, ends):
+    spiral = Spiral(Flat(), 8e-3, 5e-4, 60.0, outward, beyond=2e-3)
+    assert spiral.duration == pytest.approx(20.0)
+    assert spiral.positions(np.array([0.0, 20.0])).x == pytest.approx(ends)
 
 
 def test_a_spindle_that_turns_backwards_sees_the_mirror_image():
