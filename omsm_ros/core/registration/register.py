@@ -62,8 +62,8 @@ from omsm_ros.core.surface.shape_parameters import start_of
 from omsm_ros.errors import DataError
 
 # With the refinement that follows, spheres and off-axis paraboloids with form took 12 to 36
-# iterations.
-_MOST_TURNS = 30
+# iterations. Later steps are smaller: whole ones may go to and fro, and let points in and out.
+_WHOLE_STEPS, _MOST_TURNS = 30, 40
 # A pose has converged when its last step moved the points by less than this share of their spread.
 SHARE_OF_SPREAD, _SETTLED_M = 1e-2, 1e-10
 
@@ -81,9 +81,8 @@ def coarse_placement(
         if turn and len(points.x):
             middle = points.deviation - np.median(points.deviation)
             # The limit is wide, because the pose still contributes to the spread.
-            points = points.part(
-                np.abs(middle) <= max(8 * statistics.spread(middle), LEAST_LIMIT_M)
-            )
+            limit = max(8 * statistics.spread(middle), LEAST_LIMIT_M)
+            points = points.part(np.abs(middle) <= limit)
         if len(points.x) < least_points(points):
             break
         columns = -dof_columns(at, points, names)
@@ -95,6 +94,7 @@ def coarse_placement(
             np.array([at.value(n) for n in names]) * scale,
             [typical_range(n) for n in names] * scale,
         )
+        step /= max(turn - _WHOLE_STEPS, 1)
         at = at.moved(names, step / scale)
         settled = max(SHARE_OF_SPREAD * statistics.spread(points.deviation), _SETTLED_M)
         # The joint effect counts: a tilt may cancel a shift.

@@ -348,3 +348,16 @@ def test_memory_does_not_grow_with_the_scan():
         return used
 
     assert peak(8) < 1.1 * peak(2)
+
+
+@pytest.mark.parametrize(("depth", "middle"), [(92e-9, 0.5), (156e-9, 0.65), (198e-9, 0.8)])
+def test_a_groove_about_as_deep_as_outliers_does_not_go_in_and_out_without_end(depth, middle):
+    """Whole steps of the start went on between two poses, one with and one without its bottom."""
+    place = np.arange(1, 3001)
+    radius, angle = np.sqrt(place / 3000), 2 * np.pi * 0.6180339887 * place
+    groove = depth * np.exp(-(np.abs((radius - middle) / 0.07) ** 4))
+    height = 28e-9 * (3 * radius**3 - 2 * radius) * np.cos(angle) - groove
+    x, y = 1e-2 * radius * np.cos(angle), 1e-2 * radius * np.sin(angle)
+    batch = PointBatch(x, y, height, np.empty((0, len(x))))
+    found = register(Flat(), lambda: [batch], ("piston", "tip", "tilt"))
+    assert (found.placement.pose.tip, found.placement.pose.tilt) == pytest.approx((0, 0), abs=1e-7)
