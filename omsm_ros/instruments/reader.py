@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent import futures
-from concurrent.futures import Future
 from enum import Enum
 from typing import Any
 
@@ -57,7 +56,7 @@ class DeviceReader:
         self._back_off = back_off
         self._when_connected = connected
         self._unproven = False
-        self._requests: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = (
+        self._requests: queue.SimpleQueue[tuple[Callable[[], Any], futures.Future[Any]]] = (
             queue.SimpleQueue()
         )
 
@@ -69,7 +68,7 @@ class DeviceReader:
         """
         if self.state is not State.READING:
             raise DeviceError(f"the device is not being read now: {self.trouble or 'it ended'}")
-        done: Future[Any] = Future()
+        done: futures.Future[Any] = futures.Future()
         self._requests.put((request, done))
         try:
             return done.result(patience)

@@ -210,7 +210,7 @@ class LiveServer:
 
     def _tell(self, connection: ServerConnection) -> None:
         generation, version, turn = -1, 0, 0
-        while self._server is not None:
+        while self._server is not None:  # before websockets 17 its end closes no connection
             if turn % _STATES_EVERY == 0:
                 state = json_and_yaml.unknown_as_null(self._view.state())
                 connection.send(json_and_yaml.text_of(state))

@@ -7,6 +7,7 @@ import numpy as np
 
 from omsm_ros.core.adjustment.source_evaluation import PASSES, SPHERE, STAND_OFFS, STILL, TURNED
 from omsm_ros.core.kinematics.trajectories import (
+    BEYOND,
     PLANNED_COUNT,
     PLANNED_DWELL_S,
     PLANNED_STEP_M,
@@ -131,7 +132,7 @@ def verifying(scenario: Scenario) -> Scenario:
         part_seed=scenario.seed if scenario.part_seed is None else scenario.part_seed,
         spindle_speed=2 * scenario.spindle_speed,
         outward=not scenario.outward,
-        beyond=0.3 * scenario.start_radius,
+        beyond=BEYOND * scenario.start_radius,
     )
 
 

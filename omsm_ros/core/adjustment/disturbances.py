@@ -184,8 +184,8 @@ def _after(time: float, kind: str, scan: int) -> Family:
         shape = after if kind == "height_step" else after * v.lateral_error(-v.y, v.x)
         return np.asarray(shape[np.newaxis])
 
-    unit, wide = ("m", _HEIGHT_STEP_M) if kind == "height_step" else ("rad", _C_LOST_RAD)
-    return Family(f"{kind}@{scan}", unit, 1, only(scan, 1, columns), wide, REPEATED_TRACK)
+    unit, size = ("m", _HEIGHT_STEP_M) if kind == "height_step" else ("rad", _C_LOST_RAD)
+    return Family(f"{kind}@{scan}", unit, 1, only(scan, 1, columns), size, REPEATED_TRACK)
 
 
 def follows_removed(view: ScanView) -> float | None:

@@ -197,13 +197,13 @@ def _of_each_direction(r: Ranges) -> list[Family]:
     ]  # fmt: skip
 
 
-# Of the longer way of X from the spindle axis, the way on its other side.
+# Least way of X on the other side of the spindle axis, as a share of the longer way.
 _BOTH_SIDES = 0.1
 
 
 def _geometric(r: Ranges) -> list[Family]:
     """Centre, squareness, straightness, pitch and scale of the slides."""
-    # What a scan beyond the centre leaves open, only an artefact shows.
+    # Only an artefact shows the errors that a scan beyond the centre leaves open.
     both_sides = min(-r.slide[0], r.slide[1]) > _BOTH_SIDES * max(-r.slide[0], r.slide[1])
     beyond = REFERENCE if both_sides else BEYOND_CENTRE
     return [

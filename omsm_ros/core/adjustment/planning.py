@@ -34,6 +34,7 @@ from omsm_ros.core.adjustment.refutation import completed
 from omsm_ros.core.adjustment.scan_data import ARRAYS, LEAST_POINTS, ScanData, view_of, zero_of
 from omsm_ros.core.adjustment.sources import Contribution, Source, prior_sizes
 from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.kinematics.trajectories import BEYOND
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.aperture import within_aperture
 
@@ -51,8 +52,6 @@ _FORMS, _FORM_M, _SHARE = 40, 30e-9, 0.9
 _PAUSE_S = 20.0
 # A third turn of the part would leave its third harmonics where they were.
 _RECLOCKED_RAD = np.deg2rad(80.0)
-# Share of the radius that a scan goes on beyond the axis.
-_BEYOND = 0.3
 _RANGE_M = 1e-5
 
 
@@ -230,7 +229,7 @@ def additions(first: ScanDesign) -> dict[str, ScanDesign]:
     back = replace(first, start=first.end, end=first.start)
     fast = replace(back, rpm=2 * first.rpm)
     outer = max(first.start, first.end, key=abs)
-    beyond = (-_BEYOND * outer, outer)
+    beyond = (-BEYOND * outer, outer)
     start, end = beyond if abs(first.start) > abs(first.end) else beyond[::-1]
     return {
         OTHER_SPEED: fast,
@@ -245,7 +244,7 @@ def additions(first: ScanDesign) -> dict[str, ScanDesign]:
 
 def design_of(scan: ScanData) -> ScanDesign:
     """Return the design that ``scan`` followed, as far as it is a spiral."""
-    start, *_, end = ((scan.x + 1j * scan.y) * np.exp(1j * scan.c)).real.tolist()
+    start, end = ((scan.x + 1j * scan.y) * np.exp(1j * scan.c)).real[[0, -1]].tolist()
     return ScanDesign(
         rpm=scan.speed * 30 / np.pi,
         start=start,

@@ -60,7 +60,7 @@ def gram_of(inputs: FloatArray, target: FloatArray, taps: int) -> tuple[FloatArr
         moment[i] = signal.correlate(first, target, "valid", "fft")[::-1]
         means[i] = signal.correlate(first, np.ones(samples), "valid", "fft")[::-1] / samples
         for j, second in enumerate(inputs.T):
-            # By its first row and column and a recursion.
+            # Σ_n first[n - k] second[n - l] at place k, l: first row and column, then a recursion.
             part = gram[i, :, j]
             part[0] = signal.correlate(second, first[-samples:], "valid", "fft")[::-1]
             part[:, 0] = signal.correlate(first, second[-samples:], "valid", "fft")[::-1]

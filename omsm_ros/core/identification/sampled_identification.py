@@ -212,7 +212,7 @@ def _blocks(candidate: SampledCandidate, period: float) -> list[_Block]:
         power = np.sum(powers, axis=0)
         nearby = ndimage.maximum_filter1d(power, _LINES)
         excited = (power > _NEARBY * nearby) & (power > _LEAST_POWER * power.max())
-        # What a taper removes is leakage of other lines from the ends of the record.
+        # A taper removes the leakage of other lines from the ends of the record.
         taper = signal.windows.tukey(len(record), _TAPER)
         kept = np.sum(np.abs(np.fft.rfft(centred * taper[:, np.newaxis], axis=0)) ** 2, axis=1)
         kept, whole = (ndimage.uniform_filter1d(each, _LINES) for each in (kept, power))

@@ -155,6 +155,7 @@ PLANNED_DWELL_S = 2.0
 PLANNED_STEP_M = 9.8e-6
 # Ratio of the second height to the first, 3 µm to 9.8 µm, no simple fraction.
 SECOND_SHARE = 3 / 9.8
+BEYOND = 0.3  # share of the radius by which a verifying scan goes on beyond the axis
 # Lines of a table that a controller reads: a quarter of an hour at 1 kHz, 30 MB.
 _MOST_LINES = 1_000_000
 

@@ -108,7 +108,7 @@ def test_an_edge_that_flattens_towards_the_rim_is_continued_to_it():
 def test_the_rms_is_of_the_covered_part_of_the_rim(missing):
     """Astigmatism of 100 nm at the rim has a mean square of (100 nm)² / 6 on any such sector.
 
-    What a sector lacks along its rim is no form that the tracks miss.
+    A missing sector of the rim is no form that the tracks miss.
     """
     share = np.linspace(1, 0, 30_000)
     turn = 2 * np.pi * 60 * share

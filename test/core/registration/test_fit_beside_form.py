@@ -64,7 +64,7 @@ def test_a_basis_is_orthonormal_over_its_region_and_knows_no_plane(kind):
 
 
 def test_on_a_disc_they_are_zernikes_of_rms_one_and_rotational_ones_somewhat_higher():
-    """Of equal height at the rim rotational terms have twice the mean square, of equal rms once."""
+    """Rotational terms have twice the mean square of others that are as high at the rim."""
     basis, x, y = over("disc")
     terms = terms_up_to(8, 2)
     made = zernike_values(x / RADIUS, y / RADIUS, terms)

@@ -352,7 +352,7 @@ def test_memory_does_not_grow_with_the_scan():
 
 @pytest.mark.parametrize(("depth", "middle"), [(92e-9, 0.5), (156e-9, 0.65), (198e-9, 0.8)])
 def test_a_groove_about_as_deep_as_outliers_does_not_go_in_and_out_without_end(depth, middle):
-    """Whole steps of the start went on between two poses, one with and one without its bottom."""
+    """The start went to and fro between two poses, one with its bottom and one without."""
     place = np.arange(1, 3001)
     radius, angle = np.sqrt(place / 3000), 2 * np.pi * 0.6180339887 * place
     groove = depth * np.exp(-(np.abs((radius - middle) / 0.07) ** 4))
