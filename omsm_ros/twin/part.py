@@ -114,16 +114,14 @@ class FigureError(CheckedRecord):
 
     def deviation(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height above the nominal surface [m] at x, y [m], of their broadcast shape."""
-        radius, angle = np.hypot(x, y), np.arctan2(y, x)
-        rho = radius / self.radius
+        at, radius = (np.asarray(x) + 1j * np.asarray(y)) / self.radius, np.hypot(x, y)
         first, second = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, 2)
+        # ρⁿ cos(nθ - α) is the real part of e^(-iα) (ρ e^(iθ))ⁿ.
+        waves = self.astigmatism / 2 * np.exp(-1j * first)
+        waves = at**2 * (waves + self.trefoil / 2 * np.exp(-1j * second) * at)
         # The even cosine keeps the rings smooth at the centre.
-        error = np.asarray(
-            self.astigmatism / 2 * rho**2 * np.cos(2 * angle - first)
-            + self.trefoil / 2 * rho**3 * np.cos(3 * angle - second)
-            + self.ripple / 2 * np.cos(2 * np.pi * radius / self.ripple_pitch),
-            np.float64,
-        )
+        rings = self.ripple / 2 * np.cos(2 * np.pi * radius / self.ripple_pitch)
+        error = np.asarray(waves.real + rings, np.float64)
         return error + self.scallops(radius) if self.tool_marks else error
 
     def scallops(self, radius: FloatArray) -> FloatArray:
