@@ -127,7 +127,7 @@ def ranges() -> str:
         "A value out of its range is refused:",
         "",
         "```text",
-        "omsm: argument --accuracy: allowed residual is 20.0 m, expected a number from 1e-15 to "
+        "omsm: argument --accuracy: allowed error is 20.0 m, expected a number from 1e-15 to "
         "1 m; give it in metres, k = 2",
         "```",
         "",

@@ -213,7 +213,7 @@ MAP_POINTS = Quantity(
 CLOUD_POINTS = Quantity(
     "number of points", "", 1, 40_000_000, "write their true number, or thin them", whole=True
 )
-STEP = Quantity("height", "m", 1e-10, 1.0, "give it in metres")
+STEP = Quantity("length", "m", 1e-10, 1.0, "give it in metres")
 
 # Uncertainty.
 
@@ -221,7 +221,7 @@ UNCERTAINTY = Quantity("standard uncertainty", "m", 0.0, 10.0, "give it in metre
 TIME_UNCERTAINTY = Quantity("standard uncertainty", "s", 0.0, 1.0, "give it in seconds, k = 1")
 GAIN_UNCERTAINTY = Quantity("standard uncertainty", "", 0.0, 1e6, "give it as a share, k = 1")
 TOLERANCE = Quantity("tolerance", "m", 1e-12, 1.0, "give it in metres, peak to valley")
-BUDGET = Quantity("allowed residual", "m", 1e-15, 1.0, "give it in metres, k = 2")
+BUDGET = Quantity("allowed error", "m", 1e-15, 1.0, "give it in metres, k = 2")
 ANGLE_UNCERTAINTY = Quantity(
     "standard uncertainty", "rad", 0.0, 10.0, "give it in radians, k = 1; 10 = not known"
 )

@@ -15,20 +15,20 @@ from omsm_ros.report.verdict import headline, next_steps
 
 
 def _declare(add: Arguments) -> None:
-    add.bags("scans", nargs="+", metavar="SCAN", help="of one part, two or more")
+    add.bags("scans", nargs="+", metavar="SCAN", help="scans of one part; two or more verify it")
     add("--calibration", "CAL.json", required=True)
     add("--out", "DIR", required=True)
     add("--nominal", "SURFACE.yaml")
     add("--geometry", "GEOMETRY.yaml", "from 'omsm align'")
-    add("--sources", "SOURCES.yaml", "declared sources: the priors")
+    add("--sources", "SOURCES.yaml", "declared error sources, the priors of the fit")
     add("--clocking", ANGLE, nargs="+", default=[])
     add("--clamping", int, nargs="+", default=[])
-    add("--accuracy", UNCERTAINTY, "asked for, k = 2 [m]")
-    add("--tolerance", UNCERTAINTY, "of the peak to valley [m]")
+    add("--accuracy", UNCERTAINTY, "largest expanded uncertainty of PV accepted, k = 2 [m]")
+    add("--tolerance", UNCERTAINTY, "tolerance of the peak to valley [m]")
     add(
         "--accept",
         str,
-        f"accept what was found of a source; names as in adjustment.json, such as "
+        f"accept the found value of a source; names as in adjustment.json, such as "
         f"{next(iter(SOURCE_NAMES))}",
         nargs="+",
         default=[],

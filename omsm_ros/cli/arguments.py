@@ -21,7 +21,6 @@ _LONGEST_MESSAGE = 480
 TABLE_SUFFIX = ".csv"
 """Suffix of a table, in lower or upper case; other paths are bags."""
 
-
 ADDRESS = "OMSM_CATALOGUE"
 """Environment variable with the address of the default catalogue."""
 
@@ -145,7 +144,7 @@ class Arguments:
         self._parser, self._command = parser, command
 
     def __call__(self, name: str, kind: Any, text: str | None = None, **more: Any) -> None:
-        """Add an argument with its help ``text``; None takes that of ``words.OPTIONS``, if any.
+        """Add an argument with its help ``text`` and default; None: the text of ``words.OPTIONS``.
 
         kind: a Quantity for a plausible number, the placeholder of a path, None for a flag, or a
             function that parses the text;  more: as for ``add_argument``
@@ -158,7 +157,10 @@ class Arguments:
             read = number(kind) if isinstance(kind, Quantity) else kind
             more["type"] = _as_argument(read) if kind not in (int, str, Path) else kind
         if text is None:
-            text = OPTIONS.get(f"{self._command} {name}") or OPTIONS.get(name)
+            text = OPTIONS.get(f"{self._command} {name}") or OPTIONS.get(name, "")
+        default = more.get("default")
+        if default and isinstance(default, str | int | float | Path) and "default" not in text:
+            text = f"{text}; default: {default}".lstrip("; ")
         self._parser.add_argument(name, help=text, **more)
 
     def group(self, title: str) -> Arguments:
@@ -166,7 +168,8 @@ class Arguments:
         return Arguments(self._parser.add_argument_group(title), self._command)
 
     def epilog(self, text: str) -> None:
-        """Add a text to the end of ``--help``."""
+        """Add a text to the end of ``--help``, its lines as they are."""
+        self._parser.formatter_class = argparse.RawDescriptionHelpFormatter  # type: ignore[attr-defined]
         self._parser.epilog = text  # type: ignore[attr-defined]
 
     def bags(self, *names: str, help: str | None = None, **more: Any) -> None:

@@ -77,7 +77,7 @@ def _show_verify(facts: Facts) -> None:
 def _declare_compare(add: Arguments) -> None:
     add("old", "OLD.json")
     add("new", "NEW.json")
-    add("more", "MORE.json", nargs="*")
+    add("more", "MORE.json", nargs="*", default=[])
 
 
 def _compare(args: argparse.Namespace) -> Facts:

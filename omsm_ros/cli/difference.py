@@ -35,8 +35,8 @@ def _declare_difference(add: Arguments) -> None:
     add(
         "--fit",
         _dof_argument,
-        f"pose parameters to fit, of {','.join(MATCHING_PARAMETERS)}; 'auto': all but power "
-        f"that the surface determines; default {','.join(SEATED)}",
+        f"pose parameters to fit, of {','.join(MATCHING_PARAMETERS)}; 'auto': all but power, "
+        f"as far as the surface determines them; default {','.join(SEATED)}",
         default=SEATED,
         metavar="PARAMETERS",
     )

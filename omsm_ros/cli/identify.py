@@ -208,11 +208,10 @@ def _of_tables(args: argparse.Namespace) -> Facts:
 
 def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:
     if of_table:
-        missing = [n for n in ("output", "period") if getattr(args, n) is None]
-        if missing:
+        if args.output is None or args.period is None:
             raise ConfigurationError(
-                f"a table needs --{' and --'.join(missing)}: the output column, and the sample "
-                "period in seconds; a log with units is read by 'omsm import' first"
+                "a table needs --output, its output column, and --period, its sample period in "
+                "seconds; a log with time and units becomes a bag by 'omsm import'"
             )
         _check_for_bags(args)
     elif args.output is not None or args.period is not None:

@@ -35,7 +35,7 @@ sphere: spiral over a sphere (--radius) mounted a millimetre off the axis: centr
 
 
 def _declare(add: Arguments) -> None:
-    add("kind", str, "kind of the recording, see below", choices=(*KINDS, SPHERE))
+    add("kind", str, "kind of the recording, as listed at the end", choices=(*KINDS, SPHERE))
     add.bags("bag")
     add("--calibration", "CAL.json", required=True)
     add("--out", "SOURCES.yaml", "file to which the sources are added", required=True)

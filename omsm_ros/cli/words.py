@@ -97,7 +97,7 @@ OPTIONS = catalogue("""
 --fit: pose parameters to fit: 'auto', or of piston,tip,tilt,x,y,clocking,power; and unknown
     parameters of the shape: radius, radius_x, radius_y, conic, 'focal length', …
 --placement: standard uncertainty of x and y of the part [m], and of its clocking [rad]; what the
-    surface hardly determines is held with it; default: a part that is placed by hand
+    surface hardly determines is fixed with this uncertainty; default: a part placed by hand
 adjust --clamping: number of the clamping of each scan, where the part was taken off
 adjust --clocking: angle by which the part is turned on the chuck in each scan [rad]
 batch --scheduler: address of a Dask scheduler: tcp:// on this host, or tls://
@@ -106,7 +106,7 @@ compare more: three or more: test whether they repeat within their uncertainties
 compensate --low-pass: cutoff wavelength, of which half is compensated [m]; shorter waves remain
 compensate --previous: of the cut that made this part: its effect is checked, and the offsets are
     added to it
-correct --accuracy: required expanded uncertainty, k = 2 [m], which the verdict is based on
+correct --accuracy: largest expanded uncertainty of PV that the verdict accepts, k = 2 [m]
 correct --delay: time from the probe's stamp to the middle of its exposure [s]
 correct --pitch: measured pitch of Z: columns z_m,pitch_rad; needs abbe_arm in the geometry
 correct --probe-latency: latency of the probe against X and C [s]; default: of the calibration

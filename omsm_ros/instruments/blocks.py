@@ -13,10 +13,8 @@ from omsm_ros.instruments.counting import SAMPLE, CountedRun, Samples, Turns
 from omsm_ros.instruments.scaling import AXES, AxisScaling
 from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S, PPM
 
-# A time that is off those of its run by more was spoilt on the line [ns].
+# A time that differs from those of its run by more was damaged on the line [ns].
 _SPOILT_NS = 50_000_000
-
-
 # Crystals differ by less; beyond it the stated period is wrong.
 PERIOD_TOLERANCE = 100 * PPM
 # A free-running device that deviates by more is set to another rate.

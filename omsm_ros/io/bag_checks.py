@@ -73,7 +73,12 @@ def check_kind(path: Path) -> None:
 
 
 def check_files(path: Path) -> None:
-    """Raise BagError unless ``path`` is a regular file or a folder of regular files."""
+    """Raise BagError unless ``path`` is a regular file or a rosbag2 folder of regular files."""
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        raise BagError(
+            f"{str(path)!r} is a folder without metadata.yaml, so no rosbag2 bag; give one of its "
+            ".mcap files, or save an incomplete bag with 'omsm inspect --repair'"
+        )
     for part in sorted(path.iterdir()) if path.is_dir() else [path]:
         if not part.is_dir():
             open_regular(part, BagError, "bag").close()

@@ -39,8 +39,8 @@ def read_text(path: Path | str, limit: int, error: type[FileError], what: str) -
             return raw.decode("utf-8")
     except (OSError, UnicodeDecodeError) as err:
         raise error(
-            f"{what} {str(path)!r} cannot be read as text: {exception_text(err)}; give a text in "
-            "UTF-8"
+            f"{what} {str(path)!r} cannot be read as text: {exception_text(err)}; give a "
+            f"{what}, which is a text in UTF-8"
         ) from err
     raise error(
         f"{what} {str(path)!r} has more than {limit} bytes, the most that is accepted; "

@@ -43,7 +43,7 @@ def value_of(text: str, error: type[OmsmError], what: str) -> Any:
     except RecursionError as err:
         raise error(f"{what} is nested deeper than {MAX_DEPTH} levels; flatten it") from err
     except ValueError as err:
-        raise error(f"{what} is not JSON: {str(err)[:200]}; write it as RFC 8259 has it") from err
+        raise error(f"{what} is not JSON: {str(err)[:200]}; give JSON (RFC 8259)") from err
     return value
 
 

@@ -5,8 +5,8 @@ from omsm_ros.messages import catalogue
 TEMPLATES = catalogue("""
 verdict.verified: verified by {scans:count} scans
 verdict.except: {text}, except for what counts as declared or assumed: {names}
-verdict.rests_on: not shown by these scans, counted as declared or assumed, in all {value:m/2} of
-    the heights (k = 1)
+verdict.rests_on: not shown by these scans, counted as declared or assumed: together {value:m/2} of
+    the heights, rms (k = 1)
 verdict.to_verify: To verify {names}, {remedy}
 verdict.not_verified: not verified
 verdict.contradicted: contradicted by the scans
@@ -34,7 +34,7 @@ verdict.declared_only: declared without an evaluation, and not shown by these sc
     be off by {value:m/2}, k = 2); {remedy}, or state the recording, command or report that
     evaluates it
 verdict.looks_like: the form ({value:m/2} rms of it) looks like {names}, which these scans cannot
-    tell from the part; {remedy}, or accept it as the form of the part with omsm adjust --accept
+    separate from the part; {remedy}, or accept it as the form of the part with omsm adjust --accept
 verdict.uncertainty: expanded uncertainty {value:m/2}, larger than the accuracy of {limit:m/2} asked
     for{contribution}
 verdict.shrink: the largest contribution is {name}: its standard uncertainty of {size} would have
@@ -63,10 +63,10 @@ SOURCE_NAMES = {
     "undetected_model_error": "model error that the step test cannot detect",
     "encoder_interpolation": "interpolation of the Z encoder",
     "probe_periodic": "periodic error of the probe",
-    "probe_slope": "error of the probe by the slope, each way",
+    "probe_slope": "error of the probe proportional to the slope",
     "lag_change": "change of the structural lag since the step test",
     "probe_latency": "latency of the probe",
-    "latency_change": "latency of the readings that differs from the step test, or a long exposure",
+    "latency_change": "latency of the readings that differs from the step test or long exposure",
     "lag_asymmetry": "lag that differs between up and down",
     "motion_error": "backlash",
     "lag_speed": "lag that depends on the speed",
@@ -74,10 +74,10 @@ SOURCE_NAMES = {
     "lag_motion": "lag that depends on Z",
     "lag_x": "lag that depends on X",
     "lag_time": "lag that changes with time",
-    "lag_rate": "lag that depends on the speed of Z, or drag",
+    "lag_rate": "lag that depends on the speed of Z or drag",
     "lag_c": "lag that depends on C",
     "creep": "creep of the structure",
-    "part_turn": "turn of the part, or a late latch of C",
+    "part_turn": "turn of the part or late latch of C",
     "part_bow_speed": "bow of the part that grows with the speed",
     "unbalance": "unbalance of the spindle",
     "x_late": "late latch of X",
@@ -87,10 +87,10 @@ SOURCE_NAMES = {
     "probe_slope_fourth": "error of the probe on steep slopes",
     "probe_slope_moving": "error of the probe on slopes while Z moves",
     "c_drift": "angle of C that changes with time",
-    "part_settling": "form of the part that changes with time, as in a clamp that relaxes",
+    "part_settling": "form of the part that changes with time (relaxing clamp)",
     "centre_moved": "move of the spindle centre between scans",
     "tilt_drift": "tilt of the part that changes with time",
-    "lag_curvature": "change of the curvature of G, or a long exposure",
+    "lag_curvature": "change of the curvature of G or long exposure",
     "centre_x": "spindle centre in x",
     "centre_y": "spindle centre in y",
     "parallelism": "parallelism of Z to the spindle",
@@ -98,24 +98,24 @@ SOURCE_NAMES = {
     "encoder_scale": "scale of the Z encoder",
     "straightness_x": "straightness of X",
     "straightness_z": "straightness of Z",
-    "pitch": "pitch or bending by the height of Z",
+    "pitch": "pitch or bending along Z",
     "static_gain": "scale of the probe",
     "probe_square": "quadratic linearity error of the probe",
     "probe_linearity": "cubic linearity error of the probe",
-    "probe_slope_square": "reading of the probe on slopes",
+    "probe_slope_square": "slope error of the probe",
     "beam": "direction of the beam",
     "spindle_axial": "axial error motion of the spindle",
     "spindle_tilt": "tilt error motion of the spindle",
     "spindle_radial": "radial error motion of the spindle",
     "c_error": "angular error of C",
     "drift_rate": "steady drift",
-    "drift": "settling",
+    "drift": "decaying drift",
     "drift_walk": "random drift",
     "noise": "noise of the readings",
     "tilt": "tilt of the part",
     "decentre": "decentre of the part",
     "clocking": "clocking of the part",
-    "expansion": "expansion of the part, or scale of X",
+    "expansion": "expansion of the part or scale of X",
     "scan_differs": "form that one scan alone shows",
     "height_step": "step of the height",
     "c_lost": "lost counts of C",

@@ -72,7 +72,7 @@ def _scan_text(scan: Mapping[str, Any]) -> str:
 def _truth(facts: Mapping[str, Any]) -> Table:
     """Return what only the twin knows; a table without rows for a real part."""
     truth = facts.get("truth")
-    names = (("true PV", _PV), ("true rms", "rms"), ("map off by, rms", "map_error_rms"))
+    names = (("true PV", _PV), ("true rms", "rms"), ("rms error of the map", "map_error_rms"))
     rows = [] if truth is None else [(name, quantity(truth[key], "m")) for name, key in names]
     return Table("Truth of the twin", ("value",), rows)
 
@@ -106,7 +106,7 @@ def _declared(source: Mapping[str, Any]) -> str:
     """Return the declared standard uncertainty, or that there is none."""
     if source["declared"] is None:
         return "not declared"
-    added = " with that of the calibration" * (source["name"] in WITH_CALIBRATION)
+    added = ", that of the calibration included" * (source["name"] in WITH_CALIBRATION)
     return f"{sized(source['declared'], source['unit'], 2)}{added}"
 
 

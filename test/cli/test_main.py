@@ -279,16 +279,33 @@ def test_the_list_of_commands_has_each_once_with_its_task(capsys):
 
 
 @pytest.mark.parametrize(
+    ("command", "shown"),
+    [
+        ("twin", "spindle speed [rpm]; default: 30.0\n"),
+        ("demo", "default: out/demo\n"),
+        ("sources", "\npasses: X over the same line ten times"),
+        ("history", "default:\n                        $OMSM_CATALOGUE\n"),
+    ],
+)
+def test_help_shows_defaults_and_lists(capsys, command, shown):
+    with pytest.raises(SystemExit):
+        cli.main([command, "--help"])
+    assert shown in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
     ("arguments", "named"),
     [
         (["--json"], "command"),
         (["frob"], "'frob'"),
         (["identify"], "--out"),
         (["inspect", "a", "b"], "b"),
+        (["compare", "a"], "required: NEW.json; see"),
+        (["identify", "a.csv", "--out", "b", "--output", "u"], "needs --output, its output column"),
         (["identify", "a", "--out", "b", "--order", "9" * 400], "order"),
         (["identify", "a", "--out", "b", "--duration", "nan"], "duration"),
         (["align", "a", "--calibration", "b", "--out", "c", "--radius", "0"], "radius"),
-        (["predict", "a", "--calibration", "b", "--budget", "1e300"], "allowed residual"),
+        (["predict", "a", "--calibration", "b", "--budget", "1e300"], "allowed error"),
         (["correct", "a", "--calibration", "b", "--out", "c", "--settings", '{"a": NaN}'], "NaN"),
         (["correct", "a", "--calibration", "b", "--out", "c", "--settings", "[" * 9999], "nested"),
         (["plan", "steps", "--out", "a", "--count", "100000", "--step", "1e-10"], "fewer steps"),

@@ -244,6 +244,12 @@ NESTED_ALIASES = "&a [x, x, x, x, x, x, x, x, x]\n" + "".join(
 )
 
 
+def test_a_folder_that_is_no_bag_is_named(tmp_path, written):
+    for read in (records, ForeignBag):
+        with pytest.raises(BagError, match=r"without metadata\.yaml.*give one of its \.mcap files"):
+            read(tmp_path)
+
+
 def test_metadata_with_aliases_is_refused_at_once(tmp_path, message):
     """A few hundred bytes that unfold to gigabytes as soon as an error shows them."""
     folder = foreign_bag(tmp_path / "bag", [message], plugin=StoragePlugin.SQLITE3)

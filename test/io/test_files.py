@@ -99,7 +99,7 @@ def test_a_file_that_has_nothing_to_read_now_is_refused(tmp_path, monkeypatch):
             return None
 
     monkeypatch.setattr(files, "open_regular", lambda *_: Waits())
-    with pytest.raises(CalibrationError, match="nothing to read now; give a text"):
+    with pytest.raises(CalibrationError, match="read now; give a calibration, which is a text"):
         files.read_text(tmp_path / "x", 100, CalibrationError, "calibration")
 
 

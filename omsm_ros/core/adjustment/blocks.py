@@ -2,7 +2,7 @@
 
 All columns of the model are smooth over a few degrees of a turn, so that heights and columns may
 be averaged over a sector before they are adjusted: heights over all points, columns over a few
-that are evenly spread. What is faster than a sector is noise of the readings.
+that are evenly spread. Errors faster than a sector count as noise of the readings.
 """
 
 from __future__ import annotations

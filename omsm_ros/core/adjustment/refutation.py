@@ -14,19 +14,19 @@ from omsm_ros.core.adjustment.network import Network, Scales, Solution, estimate
 from omsm_ros.core.adjustment.sources import FREE, base_name
 from omsm_ros.core.streams.blocks import FloatArray
 
-# Of some sixty families one in five hundred clean adjustments has one beyond: 4.2 σ each.
+# One in five hundred clean adjustments has one of some sixty families beyond: 4.2 σ each.
 _UNDECLARED_LIMIT = 4.5
-# A declared size is a standard uncertainty; of a dozen, one in four hundred is beyond by chance.
+# A declared size is a standard uncertainty; by chance, one of a dozen is beyond in 1 of 400 cases.
 _DECLARED_LIMIT = 3.7
 # Twice the logarithm of odds of 150 : 1, "very strong" (Kass and Raftery 1995).
 _LEAST_GAIN = 10.0
-# Smaller than this no source matters to any accuracy asked of the method.
+# A source with a smaller effect matters for no accuracy of this method.
 _LEAST_EFFECT_M = 0.5e-9
 # Two explanations within this of each other in χ², or in their share of it, are not separated.
 _ALIKE, _ALIKE_SHARE = 12.0, 0.05
 # The models of a first cause and of the form are wrong by up to this share; it is no other cause.
 MODEL_SHARE = 0.01
-# Families that explain this share of the cause may stand behind it: no model of one is exact.
+# A family that explains this share of the evidence may be the cause: no model of one is exact.
 _RIVAL_SHARE, _RARE, _FAR_BEYOND = 0.2, 3.0, 3.0
 # A family whose value changes by less than this share is a cause of its own.
 _UNCHANGED = 0.3
@@ -35,17 +35,17 @@ _OFFSET = "lag_change"
 _MOST_RELEASED = 8
 # Further culprits that are tried first.
 _MOST_TRIED = 3
-# Before the scans: of ten errors that nobody declared, a machine has one; of ten adjustments, one
-# has a declaration that is wrong.
+# Priors: a machine has one of ten errors that are not declared; one of ten adjustments has a wrong
+# declaration.
 ODDS_ABSENT, SURE = 9.0, 50.0
 # A smaller probability lies outside an interval of 95 %.
 _LEAST_LIKELY = 0.05
-# No model excludes more; with a smaller prior, what the scans know of a family would be rounding.
+# With a smaller prior, the information of the scans on a family would be lost in rounding.
 _LEAST_PROBABLE = 1e-6
 # Starting values; each step moves a variance by 30 at most, and four are enough for 2 %.
 _WALK_START, _BAND_START_M, _CELLS_START_M = 1e-18, 3e-9, 3e-9
 _FIRST_STEPS, _FURTHER_STEPS = 5, 3
-# Of a variance: 2 % of a standard deviation.
+# Relative change of a variance: 2 % of a standard deviation.
 _SETTLED = 0.04
 
 
@@ -115,9 +115,9 @@ def settled(solution: Solution, steps: int) -> Solution:
 def fit_and_refute(
     network: Network, y: FloatArray, scales: Scales, sizes: Mapping[str, float]
 ) -> tuple[Solution, tuple[Refutation, ...], tuple[Doubt, ...]]:
-    """Return the solution with all refuted families released, which they are, and what is open.
+    """Return the solution with all refuted families released, these families, and open doubts.
 
-    Where the simplest culprit does not explain all, the next that explains as much is tried.
+    If the simplest culprit does not explain all, the next one that explains as much is tried.
     """
     solution = settled(solve(network, y, scales, sizes), _FIRST_STEPS)
     evidences = [evidence_of(solution, f) for f in network.families]
@@ -257,11 +257,11 @@ def _culprit(beyond: list[Evidence], avoided: Sequence[str]) -> Evidence:
 
 
 def probabilities(gains: Sequence[float]) -> FloatArray:
-    """Return how probable it is that each of several declarations is the one that is wrong, (k,).
+    """Return the probability that each of several declarations is the one that is wrong, (k,).
 
-    Which of them, nothing tells before the scans: each has its share of the odds, so that many
-    declarations do not make one that looks wrong by chance more probable (J. G. Scott, J. O.
-    Berger, Ann. Statist. 38, 2587). Those below 5 % are 0.
+    The prior odds are shared equally, so that many declarations do not make one that looks wrong
+    by chance more probable (J. G. Scott, J. O. Berger, Ann. Statist. 38, 2587). Probabilities
+    below 5 % are 0.
     gains: of their likelihoods (k,)
     """
     odds = np.exp(np.minimum(gains, SURE) / 2)
@@ -272,12 +272,12 @@ def probabilities(gains: Sequence[float]) -> FloatArray:
 def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Solution:
     """Return ``solution`` with every family taking part that has a name.
 
-    What is neither declared nor seen in the residuals may be there, as large as the residuals and
-    its plausible size allow: the form's uncertainty counts its mean square, which is that size
-    times the probability that it is there (Hoeting et al., Statist. Sci. 14, 382). A declaration
-    that the scans speak against, but do not refute, counts alike: it may be wrong by what they
-    found. Families that explain a part of what was seen count by that part: no model is exact, so
-    that the likelihood alone would be too sure.
+    A family that is neither declared nor significant may be present, as large as the residuals and
+    its plausible size allow. The uncertainty of the form contains its mean square: the square of
+    that size times the probability that it is present (Hoeting et al., Statist. Sci. 14, 382). The
+    same holds for a declaration that the scans doubt but do not refute: it may be wrong by the
+    found value. Families that explain a part of the evidence count by that part, because no model
+    is exact and the likelihood alone would be overconfident.
     """
     sizes: dict[str, float | FloatArray] = dict(solution.sizes)
     named = [evidence_of(solution, f) for f in solution.network.families if f.named]

@@ -143,9 +143,9 @@ def _named(causes: Sequence[Refutation], declared: Collection[str], least: float
     return found
 
 
-# Of the accuracy: what a source that is neither shown nor declared may do to the heights.
+# Share of the accuracy by which a source that is neither shown nor declared may change the heights.
 _OPEN_SHARE = 0.5
-# Where no accuracy is asked for, what matters to a mirror for visible light: rms and PV [m].
+# If no accuracy is given: what matters for a mirror for visible light, rms and PV [m].
 _OPEN_M, _OPEN_PV_M = 20e-9, 80e-9
 
 

@@ -125,7 +125,7 @@ class Calibration:
     def noise_covariance(self) -> FloatArray:
         """Covariance (p, p) by which repeated step tests of one machine scatter.
 
-        ``covariance`` contains undetected model errors besides, which are the same in all of them.
+        ``covariance`` also contains undetected model errors, which are the same in all of them.
         Equal to it where the certificate does not separate the two.
         """
         stated = self.certificate.noise_covariance

@@ -127,8 +127,8 @@ def parameter_covariance(
     passed: response through which noise of the encoder reaches the residual; None to add none.
         A sharp resonance amplifies that noise in a line too narrow for the spectrum of the residual
         to resolve.
-    walks: the noise has a random walk besides, where the residual shows one. Columns of a drift
-        describe a part of it, and their size is known better than what it would be by chance.
+    walks: the noise also has a random walk, where the residual shows one. Columns of a drift
+        describe a part of it, and their size is known better than by chance.
     """
     samples, size = columns.shape
     residual = residual * np.sqrt(samples / max(samples - size, 1))

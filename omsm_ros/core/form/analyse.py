@@ -181,7 +181,7 @@ class FormResult:
     uncovered: float
 
     def doubts(self, *, decided: bool = False) -> list[Doubt]:
-        """Return what the figures do not contain.  decided: that points left out are no defects."""
+        """Return what the figures do not contain.  decided: points left out are known dust."""
         found = []
         if self.uncovered > _COVERED_WELL:
             found.append(Doubt(Notice("form.uncovered", share=self.uncovered), None))
@@ -387,7 +387,7 @@ class _Gathered:
         # Points may come in any order, where successive points are no neighbours.
         estimates = [*np.median(self._noise, axis=0), neighbour_noise(x, y, deviation)]
         least, next_ = sorted(map(float, [*estimates, fitted]))[:2]
-        # The rest of the fit scatters least, so that a little less in another one is chance.
+        # The residual of the fit scatters least: a slightly smaller estimate is chance.
         if least < fitted < (1 + 2 * _CHANCE) * least:
             return fitted, True, fitted - least
         return least, True, length(next_ - least, _CHANCE * least)

@@ -110,8 +110,8 @@ def inflate_to_free_choice(
 ) -> ResponseUncertainty:
     """Return ``known`` of a requested order, inflated to the uncertainty of the ``free`` choice.
 
-    Too low an order has few parameters, so little noise in them, and a bias beyond what the
-    motion excites, which no residual shows. The free choice says how much stays open.
+    An order that is too low has few parameters with little noise, and a bias beyond the excited
+    frequencies that no residual shows. The free choice shows how large this can be.
     """
     mine, other = model.chosen.fit, free.chosen.fit
     if mine.structure == other.structure or mine.structure.contains(other.structure):

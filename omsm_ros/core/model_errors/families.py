@@ -135,10 +135,8 @@ class ModelErrorTerm:
 class ModelErrorFamily:
     """Terms of one kind.
 
-    part: columns (n, terms · c) of the terms from one index to another, side by side, made on
-        demand:
-        those of all terms of a long record would take gigabytes
-    width: columns of one term, c
+    part: columns (n, terms · c) of the terms from one index to another, made when they are needed:
+        those of all terms of a long record take gigabytes;  width: columns of one term, c
     """
 
     name: str

@@ -36,8 +36,8 @@ _DRIFT_DEGREE = 3
 # Even degrees of Zernike terms. Those above the usual one are tried only where it is needed.
 _DEGREES = range(2, 15, 2)
 _USUAL_DEGREE = 6
-# Least share of the residual power that a higher degree must remove, or it fits noise and lines;
-# less once the lines are known and subtracted.
+# Least share of the residual power that a higher degree must remove, otherwise it fits noise and
+# lines; a smaller share once the lines are known and subtracted.
 _WORTH, _WORTH_WITHOUT_LINES = 0.2, 0.05
 # Samples that determine the smooth form.
 _MOST_FITTED = 100_000

@@ -4,21 +4,19 @@ A trigger that one device missed, or a counter that was started later, shifts on
 the other, and only the stamps show it. The *skew* is the time of the axes minus the time of the
 distance at equal counts; after a slip it is a whole number of sample periods.
 
-The median skew of about a second is judged every 0.2 s. A slip begins at
-``|median| >= period / 2 + tolerance + 3 scatter``. It ends at
-``|median| < period / 2 + tolerance``. Between the two the last verdict holds; before the first one
-the pairs wait, and after ten seconds it is a slip. The scatter is that
-within the second, or that over the last half minute if it is larger, because a driver's clock
-wanders while it is estimated from arrivals. The error of that estimate is bounded by its movement:
-the earliest of n arrivals is late by about 1/n of their scatter, so it was by k/n of that when
-there were n/k.
+The median skew of about a second is judged every 0.2 s. A slip begins at ``|median| >= period / 2 +
+tolerance + 3 scatter`` and ends at ``|median| < period / 2 + tolerance``. Between the two limits
+the last verdict holds. Before the first verdict the pairs wait; after ten seconds it is a slip. The
+scatter is that of the second, or of the last half minute if it is larger, because a driver's clock
+wanders while it is estimated from arrivals. The movement of that estimate bounds its error: the
+earliest of n arrivals is late by about 1/n of their scatter, the earliest of n/k by k/n of it.
 
-The delays of two devices may differ by half a period and more, and hide a slip. So a median that
-differs from the usual one by ``period / 2 + 3 scatter`` is a slip, too.
+A difference of the delays of two devices of half a period or more compensates a slip. So a median
+that differs from the usual one by ``period / 2 + 3 scatter`` is a slip, too.
 
-A pair waits until stamps of both streams that agree have come after it. At the start it waits for
-the first verdict, and after a stamp that is off for the verdict on the stamps that follow. Blocks
-of one driver carry the same stamps to the nanosecond and never wait.
+A pair waits for later stamps of both streams that agree. At the start it waits for the first
+verdict, and after a deviating stamp for the verdict on the stamps that follow. Blocks of one driver
+carry the same stamps to the nanosecond and never wait.
 
 A decision uses only the stamps of blocks up to its count, so that live and offline agree.
 """
@@ -139,7 +137,7 @@ class TriggerSlipDetector:
     """Judges pairs of two streams by the stamps of their blocks.
 
     sessions: of axes and distance, whose pairs are judged
-    found: the last slip, also if it has ended; None if there was none
+    found: the last slip, even if it has ended; None if there was none
     same_stamps: both streams carry the stamps of one device, which latches both
     in_doubt: since the start the stamps neither agree nor show a slip
     """

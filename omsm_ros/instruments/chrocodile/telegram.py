@@ -60,7 +60,7 @@ SIGNALS = {
     SAMPLE_COUNTER: Signal("samples, wraps", U16),
 }
 
-# No selection of signals makes longer telegrams; a longer one is a description misread.
+# No selection of signals makes longer telegrams; a longer one is a misread description.
 MAX_TELEGRAM_BYTES = 4096
 
 

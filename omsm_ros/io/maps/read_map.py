@@ -50,7 +50,7 @@ def _head(path: Path) -> bytes:
     if head.startswith(_BAGS):
         raise FileError(
             f"{str(path)!r} is a bag, no map; make points of it with 'omsm correct', or give "
-            "'omsm form' its --calibration, too; one of ROS 1 needs 'omsm import' first"
+            "'omsm form' its --calibration, too; a bag of ROS 1 needs 'omsm import' first"
         )
     return head
 

@@ -36,7 +36,6 @@ _LIMIT: dict[str, Any] = {"color": style.TRUTH, "linewidth": 0.8, "linestyle": (
 _SPAN: dict[str, Any] = {"color": style.AFTER, "alpha": 0.18, "linewidth": 0}
 _BEFORE_EDGE_S, _AFTER_EDGE_S = 30e-3, 60e-3
 
-
 BAND = "band"
 CAPTIONS = {
     BAND: (
