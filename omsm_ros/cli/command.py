@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from omsm_ros.core.calibration.calibration import Calibration
 
 Facts: TypeAlias = dict[str, Any]
+LIMIT = "{value:{unit}} of {allowed:{unit}}"
+"""Template of a limit of a motion."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from omsm_ros.cli.arguments import (
     refuse_cell,
     trigger_of,
 )
-from omsm_ros.cli.command import CliCommand, Facts, table, written
+from omsm_ros.cli.command import LIMIT, CliCommand, Facts, table, written
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows, registration_of
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
@@ -30,6 +30,7 @@ from omsm_ros.io.descriptions import (
     save_geometry,
 )
 from omsm_ros.io.folders import MEASUREMENT_FILES, result_folder
+from omsm_ros.messages import rows_from, text_from
 from omsm_ros.pipelines.correct import Admission, StampJoining
 from omsm_ros.pipelines.history import keep_measurement, record_in_catalogue
 from omsm_ros.pipelines.measure import measure
@@ -162,21 +163,23 @@ def _predict(args: argparse.Namespace) -> Facts:
     return asdict(predict_error(calibration, path, args.budget, load_limits(args.limits)))
 
 
+_PREDICTED = {
+    "dynamic error": "{peak_to_valley:m/4} PV, {rms:m/4} rms",
+    "after correction": "{residual:m} (k = 1)",
+    "  undetected model error": "{residual_undetected:m}",
+    "Z above the valid band": "{outside_band_rms:m/2} rms, noise of the encoder included",
+}
+
+
 def _show_predict(facts: Facts) -> None:
     table(
         [
             ("verdict", "safe" if facts["safe"] else "NOT safe"),
-            ("dynamic error", f"{quantity(facts['peak_to_valley'], 'm', 4)} PV, "
-                              f"{quantity(facts['rms'], 'm', 4)} rms"),
-            ("after correction", f"{quantity(facts['residual'], 'm')} (k = 1)"),
-            ("  undetected model error", quantity(facts["residual_undetected"], "m")),
-            ("Z above the valid band", f"{quantity(facts['outside_band_rms'], 'm', 2)} rms, noise "
-                                       "of the encoder included"),
+            *rows_from(facts, _PREDICTED),
             ("maximum speed", f"{_times(facts['speed_factor'])} this motion, limited by "
                               f"{facts['binding']}"),
-            *((f"  limit: {one['name']}", f"{quantity(one['value'], one['unit'])} of "
-               f"{quantity(one['allowed'], one['unit'])}, maximum speed "
-               f"{_times(one['speed_factor'])}") for one in facts["limits"]),
+            *((f"  limit: {one['name']}", text_from(LIMIT, one)
+               + f", maximum speed {_times(one['speed_factor'])}") for one in facts["limits"]),
             ("not evaluated", ", ".join(facts["not_evaluated"]) or "nothing"),
             *((name, facts[key]) for name, key in (("not judged", "left_out"), ("advice", "advice"))
               if facts[key]),

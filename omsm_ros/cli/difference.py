@@ -11,6 +11,7 @@ from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.descriptions import load_surface
 from omsm_ros.io.files import DIFFERENCE, REPORT
 from omsm_ros.io.folders import result_folder
+from omsm_ros.messages import text_from
 from omsm_ros.pipelines.difference import (
     MAP,
     ComparisonOptions,
@@ -18,7 +19,7 @@ from omsm_ros.pipelines.difference import (
     write_difference,
 )
 from omsm_ros.quantities import SPACING, UNCERTAINTY
-from omsm_ros.readable import count, figure, percent, plain, quantity
+from omsm_ros.readable import figure
 
 
 def _dof_argument(text: str) -> tuple[str, ...]:
@@ -66,37 +67,33 @@ def _difference(args: argparse.Namespace) -> Facts:
     return {**facts, "files": files, "out": str(args.out)}
 
 
+_EXTENTS = "{peak_to_valley:m/4} PV, {robust_peak_to_valley:m/4} PV of 99.5 %, {rms:m/4} rms"
+_GRID = (
+    "{difference[places]:count} places, {resampling[spacing]:m/4} apart, on "
+    "{difference[shared_area]:%/3} of the smaller area"
+)
+
+
 def _show_difference(facts: Facts) -> None:
     found = facts["difference"]
     rows = [("verdict", facts["verdict"])]
     rows += [("because", text) for text in facts["reasons"]]
     rows += [("but", text) for text in facts["reservations"]]
     rows += [
-        ("difference", f"{_length(found['peak_to_valley'])} PV, "
-                       f"{_length(found['robust_peak_to_valley'])} PV of 99.5 %, "
-                       f"{_length(found['rms'])} rms"),
+        ("difference", text_from(_EXTENTS, found)),
         ("uncertainty", "not evaluated" if found["uncertainty"] is None else
-                        f"{_length(found['uncertainty'])} rms (k = 1)"),
-        ("grid", f"{count(found['places'])} places, {_length(facts['resampling']['spacing'])} "
-                 f"apart, on {percent(found['shared_area'], 3)} of the smaller area"),
+                        text_from("{uncertainty:m/4} rms (k = 1)", found)),
+        ("grid", text_from(_GRID, facts)),
     ]  # fmt: skip
     for name, n in facts["e_n"].items():
-        words = (
-            "not evaluated"
-            if n["e_n"] is None
-            else f"{plain(n['e_n'])} (U {_length(n['expanded'])})"
-        )
-        label = f"E_n of {figure(name)}"
-        rows.append((label, f"{words}: {_length(n['a'])} and {_length(n['b'])}"))
+        number = "not evaluated" if n["e_n"] is None else "{e_n:plain} (U {expanded:m/4})"
+        text = text_from(f"{number}: {{a:m/4}} and {{b:m/4}}", n)
+        rows.append((f"E_n of {figure(name)}", text))
     if facts["within"] is not None:
-        rows.append(("points", f"|E_n| < 1 on {percent(facts['within'], 3)} of the area"))
+        rows.append(("points", text_from("|E_n| < 1 on {within:%/3} of the area", facts)))
     for name in ("a", "b"):
         rows += [(f"note on {name.upper()}", text) for text in facts[name]["notes"]]
     table([*rows, written(facts["files"].values(), facts["out"])])
-
-
-def _length(value: float) -> str:
-    return quantity(value, "m", 4)
 
 
 COMMANDS = (CliCommand("difference", _declare_difference, _difference, _show_difference),)

@@ -20,8 +20,9 @@ from omsm_ros.io.maps.instrument_files import write_hdf5, write_sdf, write_x3p
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.maps.vertex_file import write_pcd, write_ply
 from omsm_ros.io.results import CloudFile
+from omsm_ros.messages import rows_from
 from omsm_ros.quantities import SPACING
-from omsm_ros.readable import count, quantity
+from omsm_ros.readable import count
 from omsm_ros.units import LengthUnits
 
 AS_POINTS = (".csv", ".xyz", ".h5", ".hdf5", ".ply", ".pcd")
@@ -136,16 +137,18 @@ def _export(args: argparse.Namespace) -> Facts:
     return {"source": str(args.source), **made}
 
 
+_OF_MAP = {
+    "map": "{columns} × {rows} pixels of {spacing[0]:m/4} × {spacing[1]:m/4}, {missing:count} "
+    "without a height",
+    "resampling": "{resampling}",
+    "resampling error": "at most {interpolation_error:m/2} rms",
+}
+
+
 def _show_export(facts: Facts) -> None:
     rows = [("points", count(facts["points"]))]
     if "resampling" in facts:
-        spacing = " × ".join(quantity(part, "m", 4) for part in facts["spacing"])
-        rows += [
-            ("map", f"{facts['columns']} × {facts['rows']} pixels of {spacing}, "
-                    f"{count(facts['missing'])} without a height"),
-            ("resampling", facts["resampling"]),
-            ("resampling error", f"at most {quantity(facts['interpolation_error'], 'm', 2)} rms"),
-        ]  # fmt: skip
+        rows += rows_from(facts, _OF_MAP)
     table([*rows, written([facts["file"]])])
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.cli.arguments import Arguments, cell_of, refuse_cell
-from omsm_ros.cli.command import CliCommand, Facts, table, written
+from omsm_ros.cli.command import LIMIT, CliCommand, Facts, table, written
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows, registration_of
 from omsm_ros.core.form.compensation import (
     CutSurface,
@@ -33,6 +33,7 @@ from omsm_ros.io.descriptions import load_limits, load_surface
 from omsm_ros.io.files import CURVES, DEVIATION, FORM, REPORT, save_bytes, save_text
 from omsm_ros.io.folders import FORM_FILES, MEASUREMENT_FILES, result_folder
 from omsm_ros.io.gcode_file import path_gcode as program_of
+from omsm_ros.messages import text_from
 from omsm_ros.pipelines.form import (
     OpenedMeasurement,
     RegistrationOptions,
@@ -389,21 +390,20 @@ _FOLLOWS = {True: "can follow", False: "CANNOT follow", None: "not evaluated"}
 
 
 def _show_surface(facts: Facts) -> None:
-    x, y = (quantity(part, "m") for part in facts["steepest_at"])
-    angle = f"{plain(facts['steepest_angle'] / DEGREE_RAD)}°"
+    degrees = plain(facts["steepest_angle"] / DEGREE_RAD)
+    at = text_from("x = {steepest_at[0]:m}, y = {steepest_at[1]:m}", facts)
     drawn = [written([facts["figure"]], facts["out"])] if "figure" in facts else []
     table(
         [
             ("peak to valley", quantity(facts["peak_to_valley"], "m")),
-            ("steepest", f"{angle} at x = {x}, y = {y}"),
+            ("steepest", f"{degrees}° at {at}"),
             ("probe", _FOLLOWS[facts["probe_can_follow"]]),
             ("axes", _FOLLOWS[facts["axes_can_follow"]]),
-            *((f"  {limit['name']}", f"{quantity(limit['value'], limit['unit'])} of "
-               f"{quantity(limit['allowed'], limit['unit'])}") for limit in facts["limits"]),
+            *((f"  {limit['name']}", text_from(LIMIT, limit)) for limit in facts["limits"]),
             ("not evaluated", ", ".join(facts["not_evaluated"])),
             *drawn,
         ]
-    )  # fmt: skip
+    )
 
 
 COMMANDS = (

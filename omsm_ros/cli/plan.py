@@ -162,7 +162,7 @@ def _plan_scans(args: argparse.Namespace) -> Facts:
 
 def _plan_motion(args: argparse.Namespace) -> Facts:
     from omsm_ros.core.adjustment import ScanDesign
-    from omsm_ros.pipelines.plan_scans import path_entry, refuse_beyond, write_scans
+    from omsm_ros.pipelines.plan_scans import refuse_beyond, write_scans
 
     nominal = _nominal(args)
     modes = [(frequency, 0.0) for frequency in args.mode]
@@ -178,7 +178,7 @@ def _plan_motion(args: argparse.Namespace) -> Facts:
         rpm=best.rpm, start=_radius(args, nominal), end=0.0, pitch=best.feed, rate=best.rate
     )
     refuse_beyond(design, nominal, load_limits(args.limits), args.accuracy)
-    (path,) = write_scans(
+    programs = write_scans(
         [design], nominal, args.out, args.path_error, args.servo_period, args.dialect
     )
     rows = [{**asdict(one), "score": one.score} for one in (asked, best)]
@@ -187,9 +187,7 @@ def _plan_motion(args: argparse.Namespace) -> Facts:
         "modes": modes,
         "orders": orders.tolist(),
         "duration": design.duration,
-        "path_error": args.path_error,
-        "paths": [path_entry(path, design, nominal)],
-        "files": [str(args.out / f"scan_1.{end}") for end in ("csv", "nc")],
+        **programs,
     }
 
 

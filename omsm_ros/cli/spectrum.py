@@ -8,6 +8,7 @@ from omsm_ros.core.ripple.lines import MOST_LINES
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_surface
 from omsm_ros.io.files import SPECTRUM
+from omsm_ros.messages import text_from
 from omsm_ros.pipelines.correct import Admission
 from omsm_ros.pipelines.spectrum import SpectrumOptions, publish_spectra
 from omsm_ros.quantities import EXPOSURE, FREQUENCY, SPOT
@@ -46,8 +47,11 @@ def _show_spectrum(facts: Facts) -> None:
     if facts["exposure"] is not None:
         say(facts["exposure"]["finding"])
     for scan in facts["scans"]:
-        say(f"{scan['name']}: {scan['samples']['analysed']} points, "
-              f"{quantity(scan['noise']['rms'], 'm')} rms without its lines")  # fmt: skip
+        say(
+            text_from(
+                "{name}: {samples[analysed]} points, {noise[rms]:m} rms without its lines", scan
+            )
+        )
         peaks = scan["peaks"]
         rows = [_peak_row(peak) for peak in peaks[:_MOST_SHOWN]] or [("", "no line beyond 3 σ")]
         if more := len(peaks) - _MOST_SHOWN:
@@ -57,8 +61,7 @@ def _show_spectrum(facts: Facts) -> None:
             say(f"weaker lines than the {MOST_LINES} strongest were not sought")
         table([("  vibration", one["finding"]) for one in scan["vibration_removed"]])
         if stopped := scan["band_stop"]:
-            say(f"band stop, zero phase: {quantity(stopped['rms_before'], 'm')} → "
-                  f"{quantity(stopped['rms_after'], 'm')} rms")  # fmt: skip
+            say(text_from("band stop, zero phase: {rms_before:m} → {rms_after:m} rms", stopped))
     table([written(facts["files"].values(), facts["out"])])
 
 
@@ -73,8 +76,8 @@ def _peak_row(peak: Facts) -> tuple[str, str]:
     why = "; ".join([*peak["evidence"], *([peak["needs"]] if peak["needs"] else [])])
     size = quantity(peak["amplitude"], "m")
     if peak["amplitude_on_part"] is not None:
-        size += f" (on the part {quantity(peak['amplitude_on_part'], 'm')} ± "
-        size += f"{quantity(peak['amplitude_on_part_uncertainty'], 'm', 2)})"
+        on_part = " (on the part {amplitude_on_part:m} ± {amplitude_on_part_uncertainty:m/2})"
+        size += text_from(on_part, peak)
     return f"  {where}", f"{size}, {plain(peak['significance'])} σ: {what}: {why}"
 
 

@@ -10,8 +10,9 @@ of Python or how :mod:`omsm_ros.readable` writes the number:
 | field | written as |
 |---|---|
 | ``{noise:m}``, ``{lag:s}``, ``{rate:Hz/4}`` | quantity with SI prefix, to 3 or 4 digits |
+| ``{value:{unit}}`` | the same in the unit that another value names |
 | ``{share:%}`` | percent |
-| ``{p:chance}`` | ``p = 0.02`` |
+| ``{p:chance}``, ``{p:probability}`` | ``p = 0.02``, ``0.02`` |
 | ``{n:count}`` | number of things, ``290 011`` |
 | ``{lost:counts}`` | mapping of counts, ``3 not ok, 1 duplicate`` |
 | ``{factor:plain/2}`` | number without unit, to 2 digits |
@@ -27,7 +28,7 @@ To add a message, add its code and template to the catalogue of its room in this
 import importlib
 import pkgutil
 import string
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
@@ -37,7 +38,7 @@ from omsm_ros import readable
 COMMAND, NODE, PYTHON = "command", "node", "python"
 _audience = PYTHON
 
-_UNITS = {"m", "s", "Hz", "rad", "m/s", "m/s²", "ppm", "K", "°C", "rpm", "kg", "samples/s"}
+_UNITS = {"m", "s", "Hz", "rad", "m/s", "m/s²", "m/s³", "ppm", "K", "°C", "rpm", "kg", "samples/s"}
 
 
 @contextmanager
@@ -56,7 +57,17 @@ def sentence(code: str, values: Mapping[str, Any]) -> str:
     template = templates().get(code)
     if template is None:
         return code
-    return str(_Formatter().vformat(template, (), {**values, "opt": _Options()}))
+    return text_from(template, {**values, "opt": _Options()})
+
+
+def text_from(template: str, values: object) -> str:
+    """Return a template filled with the entries of a mapping, or the attributes of a record."""
+    return str(_Formatter().vformat(template, (), values))  # type: ignore[arg-type]
+
+
+def rows_from(values: object, rows: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Return the rows of a table, name → template, with their templates filled."""
+    return [(name, text_from(template, values)) for name, template in rows.items()]
 
 
 @lru_cache(maxsize=1)
@@ -102,6 +113,7 @@ class _Options:
 _WITH_DIGITS: dict[str, Callable[..., str]] = {"%": readable.percent, "plain": readable.plain}
 _WRITERS: dict[str, Callable[[Any], str]] = {
     "chance": readable.p_value_text,
+    "probability": readable.probability,
     "count": readable.count,
     "counts": readable.counts_text,
     "list": lambda items: ", ".join(map(str, items)) or "none",
@@ -115,6 +127,9 @@ _WRITERS: dict[str, Callable[[Any], str]] = {
 
 class _Formatter(string.Formatter):
     """Format numbers as :mod:`omsm_ros.readable` writes them where the format names a unit."""
+
+    def get_value(self, key: int | str, args: Sequence[Any], kwargs: Any) -> Any:
+        return kwargs[key] if isinstance(kwargs, Mapping) else getattr(kwargs, str(key))
 
     def format_field(self, value: Any, format_spec: str) -> str:
         kind, _, digits = (

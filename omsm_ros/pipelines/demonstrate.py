@@ -32,6 +32,7 @@ from omsm_ros.io.files import (
     save_text,
 )
 from omsm_ros.io.results import CloudFile
+from omsm_ros.messages import text_from
 from omsm_ros.pipelines.adjust import (
     ADJUSTED_CLOUD,
     ADJUSTMENT,
@@ -353,16 +354,12 @@ def sample_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
 
 
 def _accuracy_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
-    before, after = summary["dynamic_error_before"], summary["dynamic_error_after"]
+    spread = "{peak_to_valley:m} PV, {rms:m} rms (by area)"
+    off = "rms {rms:m}, of which {probe_noise_and_resolution:m} from the probe's noise"
     yield from adjustment_rows(summary["adjustment"])
-    yield "dynamic error before", _spread(before)
-    yield "  after correction", _spread(after)
-    surface = summary["surface_deviation"]
-    floor = quantity(surface["probe_noise_and_resolution"], "m")
-    yield (
-        "cloud minus true surface",
-        f"rms {quantity(surface['rms'], 'm')}, of which {floor} from the probe's noise",
-    )
+    yield "dynamic error before", text_from(spread, summary["dynamic_error_before"])
+    yield "  after correction", text_from(spread, summary["dynamic_error_after"])
+    yield "cloud minus true surface", text_from(off, summary["surface_deviation"])
     for row in summary["response"]:
         yield (
             f"error of G at {quantity(row['frequency'], 'Hz')}",
@@ -377,14 +374,5 @@ def adjustment_rows(adjusted: dict[str, Any]) -> Iterable[tuple[str, str]]:
     yield "  verdict", adjusted["verdict"]["text"]
     for reason in adjusted["verdict"]["reasons"]:
         yield "", reason["text"]
-    truth = adjusted["truth"]
-    yield (
-        "  truth of the twin",
-        f"PV {quantity(truth['peak_to_valley'], 'm')}; the map is off by "
-        f"{quantity(truth['map_error_rms'], 'm', 2)} rms",
-    )
-
-
-def _spread(spread: dict[str, float]) -> str:
-    pv, rms = quantity(spread["peak_to_valley"], "m"), quantity(spread["rms"], "m")
-    return f"{pv} PV, {rms} rms (by area)"
+    truth = "PV {peak_to_valley:m}; the map is off by {map_error_rms:m/2} rms"
+    yield "  truth of the twin", text_from(truth, adjusted["truth"])

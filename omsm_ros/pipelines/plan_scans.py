@@ -98,20 +98,14 @@ def plan_facts(
     accuracy: float,
     out: Path,
     nominal: Surface,
-    dialect: str = "linuxcnc",
-    bound: float = PATH_ERROR_M,
-    cycle: float = SERVO_PERIOD_S,
+    dialect: str,
+    bound: float,
+    cycle: float,
 ) -> dict[str, Any]:
-    """Write the programs of the best set into ``out``, and return what was planned.
-
-    For each scan scan_N.csv (time_s, x_m, z_m, c_rad) and scan_N.nc (G-code).
-
-    bound: on the distance of the executed path from the surface [m];  cycle: of the servo [s]
-    """
+    """Write the programs of the best set into ``out`` by :func:`write_scans`; return the facts."""
     best = sets[0]
-    paths = write_scans(best.designs, nominal, out, bound, cycle, dialect)
     return {
-        "path_error": bound,
+        **write_scans(best.designs, nominal, out, bound, cycle, dialect),
         "set": best.name,
         "reaches": best.reaches,
         "accuracy": accuracy,
@@ -126,21 +120,10 @@ def plan_facts(
             }
             for planned in sets
         ],
-        "paths": [
-            path_entry(path, design, nominal)
-            for path, design in zip(paths, best.designs, strict=True)
-        ],
-        "files": [
-            str(out / f"scan_{k + 1}.{end}") for k in range(len(paths)) for end in ("csv", "nc")
-        ],
     }
 
 
-def path_entry(path: PlannedPath, design: ScanDesign, nominal: Surface) -> dict[str, float]:
-    """Return error [m], rms [m], segment [s] and acceleration of C [rad/s²] of a path.
-
-    Also its points on the part, where the aperture is known.
-    """
+def _path_entry(path: PlannedPath, design: ScanDesign, nominal: Surface) -> dict[str, float]:
     found = {f: getattr(path, f) for f in ("error", "rms", "segment", "c_acceleration")}
     if isinstance(nominal, BoundedSurface):
         time = np.arange(0.0, design.duration, 1 / design.rate, dtype=np.float64)
@@ -157,17 +140,25 @@ def write_scans(
     bound: float,
     cycle: float,
     dialect: str = "linuxcnc",
-) -> list[PlannedPath]:
-    """Write scan_N.csv and scan_N.nc of each design into ``out``; return their paths."""
-    paths = []
+) -> dict[str, Any]:
+    """Write scan_N.csv (time_s, x_m, z_m, c_rad) and scan_N.nc (G-code) of each design.
+
+    bound: on the distance of the executed path from the surface [m];  cycle: of the servo [s]
+
+    Return the bound, the files, and of each path its error [m], rms [m], segment [s], acceleration
+    of C [rad/s²], and its points on the part where the aperture is known.
+    """
+    paths, files = [], []
     for k, design in enumerate(designs):
         path, text = scan_program(design, nominal, bound, cycle, dialect)
         columns = zip(path.time, path.x, path.height, path.c, strict=True)
         rows = (f"{a:.6f},{b:.10f},{d:.12f},{e:.8f}" for a, b, d, e in columns)
-        save_text(out / f"scan_{k + 1}.csv", "\n".join([_HEAD, *rows]) + "\n")
-        save_text(out / f"scan_{k + 1}.nc", text)
-        paths.append(path)
-    return paths
+        csv, gcode = (out / f"scan_{k + 1}.{end}" for end in ("csv", "nc"))
+        save_text(csv, "\n".join([_HEAD, *rows]) + "\n")
+        save_text(gcode, text)
+        paths.append(_path_entry(path, design, nominal))
+        files += [str(csv), str(gcode)]
+    return {"path_error": bound, "paths": paths, "files": files}
 
 
 def scan_program(

@@ -19,10 +19,10 @@ from omsm_ros.core.ripple.source_hypotheses import (
     VIBRATION,
     StudiedScan,
 )
-from omsm_ros.readable import count, plain, quantity
+from omsm_ros.readable import plain, quantity
 from omsm_ros.report import style
 from omsm_ros.report.page_parts import Section, fill_study
-from omsm_ros.report.tables import Table
+from omsm_ros.report.tables import Table, filled
 from omsm_ros.report.verdict import PageVerdict
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
@@ -167,7 +167,9 @@ def render(summary: Mapping[str, Any], figures: Mapping[str, bytes]) -> str:
         sections=(
             Section("Lines", ("time",), tuple(peak_table(scan) for scan in scans)),
             Section("Evidence", ("evidence", "path"), (_acceleration_table(scans),)),
-            Section("Scans", ("motion",), (_scan_table(scans), _sampling_table(scans))),
+            Section(
+                "Scans", ("motion",), (filled("", scans, "{name}", _SCANS), _sampling_table(scans))
+            ),
             Section("Removed", tables=(_stop_table(scans), _vibration_table(scans))),
         ),
         captions=CAPTIONS,
@@ -219,72 +221,50 @@ def _true(peak: Mapping[str, Any]) -> str:
 
 
 def _acceleration_table(scans: Sequence[Mapping[str, Any]]) -> Table:
-    rows = [
-        (
-            f"{scan['name']}, {line['axis']}",
-            quantity(line["frequency"], "Hz", 5),
-            f"{plain(line['acceleration'])} m/s²",
-            quantity(line["displacement"], "m"),
-            plain(line["significance"]),
-        )
-        for scan in scans
-        if scan["accelerometer"]
-        for line in scan["accelerometer"]["lines"]
-    ]
-    return Table("Accelerometer lines", ("frequency", "acceleration", "motion", "σ"), rows)
+    shaken = [scan for scan in scans if scan["accelerometer"]]
+    lines = [{**line, "scan": s["name"]} for s in shaken for line in s["accelerometer"]["lines"]]
+    columns = {
+        "frequency": "{frequency:Hz/5}",
+        "acceleration": "{acceleration:plain} m/s²",
+        "motion": "{displacement:m}",
+        "σ": "{significance:plain}",
+    }
+    return filled("Accelerometer lines", lines, "{scan}, {axis}", columns)
 
 
-def _scan_table(scans: Sequence[Mapping[str, Any]]) -> Table:
-    rows = [
-        (
-            scan["name"],
-            count(scan["samples"]["analysed"]),
-            quantity(scan["duration"], "s"),
-            quantity(scan["spindle_speed_rpm"], "rpm"),
-            quantity(scan["path_length"], "m"),
-            quantity(scan["form"]["rms_removed"], "m"),
-            quantity(scan["noise"]["rms"], "m"),
-            quantity(scan["noise"]["amplitude"], "m"),
-            quantity(scan["motion"]["outside_band_rms"], "m"),
-        )
-        for scan in scans
-    ]
-    columns = (
-        *("points", "duration", "spindle", "path", "form removed, rms", "residual, rms"),
-        *("σ of an amplitude", "motion outside the band"),
-    )
-    return Table("", columns, rows)
+_SCANS = {
+    "points": "{samples[analysed]:count}",
+    "duration": "{duration:s}",
+    "spindle": "{spindle_speed_rpm:rpm}",
+    "path": "{path_length:m}",
+    "form removed, rms": "{form[rms_removed]:m}",
+    "residual, rms": "{noise[rms]:m}",
+    "σ of an amplitude": "{noise[amplitude]:m}",
+    "motion outside the band": "{motion[outside_band_rms]:m}",
+}
+_STOPS = {
+    "bands": "{bands}",
+    "rms before": "{rms_before:m}",
+    "rms after": "{rms_after:m}",
+    "removed": "{rms_removed:m}",
+    "phase": "0, forward and backward",
+    "settling at the ends": "{settling_at_the_ends:s}",
+}
 
 
 def _sampling_table(scans: Sequence[Mapping[str, Any]]) -> Table:
-    rows = [
-        (
-            f"{scan['name']}, radius {quantity(place['radius'], 'm')}",
-            quantity(place["distance"], "m", 4),
-            quantity(place["shortest_wavelength"], "m", 4),
-        )
-        for scan in scans
-        for place in scan["sampling"]
-    ]
-    return Table("Sampling of the part", ("distance", "shortest wavelength"), rows)
+    places = [{**place, "scan": scan["name"]} for scan in scans for place in scan["sampling"]]
+    columns = {"distance": "{distance:m/4}", "shortest wavelength": "{shortest_wavelength:m/4}"}
+    return filled("Sampling of the part", places, "{scan}, radius {radius:m}", columns)
 
 
 def _stop_table(scans: Sequence[Mapping[str, Any]]) -> Table:
-    rows = [
-        (
-            scan["name"],
-            ", ".join(f"{plain(low)} to {plain(high)} Hz" for low, high in stop["bands"]),
-            quantity(stop["rms_before"], "m"),
-            quantity(stop["rms_after"], "m"),
-            quantity(stop["rms_removed"], "m"),
-            "0, forward and backward",
-            quantity(stop["settling_at_the_ends"], "s"),
+    stops = [{**scan["band_stop"], "scan": scan["name"]} for scan in scans if scan["band_stop"]]
+    for stop in stops:
+        stop["bands"] = ", ".join(
+            f"{plain(low)} to {plain(high)} Hz" for low, high in stop["bands"]
         )
-        for scan in scans
-        if (stop := scan["band_stop"])
-    ]
-    columns = ("bands", "rms before", "rms after", "removed", "phase", "settling at the ends")
-    return Table("", columns, rows)
+    return filled("", stops, "{scan}", _STOPS)
 
 
 def _vibration_table(scans: Sequence[Mapping[str, Any]]) -> Table:

@@ -1,12 +1,13 @@
 """Tables of a report: numbers as text, with their units."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.machine_sources import OF_CALIBRATION
+from omsm_ros.messages import text_from
 from omsm_ros.readable import NOTHING, column, count, measured, number, plain, quantity
 
 _OPEN = "not evaluated"
@@ -32,6 +33,23 @@ class Table:
     columns: Sequence[str]
     rows: Sequence[tuple[str, ...]]
     prose: str = ""
+
+
+def filled(
+    title: str, items: Iterable[object], label: str, columns: Mapping[str, str], prose: str = ""
+) -> Table:
+    """Return a table of ``items``; label, columns: templates, as :mod:`omsm_ros.messages` has them.
+
+    columns: name → template of its cells
+    """
+    templates = (label, *columns.values())
+    rows = [tuple(text_from(template, item) for template in templates) for item in items]
+    return Table(title, tuple(columns), rows, prose)
+
+
+def known_rows(rows: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Return the rows that have something in the first column after their label."""
+    return [row for row in rows if row[1] != NOTHING]
 
 
 def part(mapping: Mapping[str, Any], *path: str) -> Any:
@@ -117,7 +135,7 @@ def calibration_table(calibration: Calibration) -> Table:
         ("sample period", quantity(calibration.sample_period, "s")),
         ("id", calibration.id[:16]),
     ]
-    return Table("Calibration", (), [row for row in rows if row[1] != NOTHING])
+    return Table("Calibration", (), known_rows(rows))
 
 
 def mapping_table(title: str, values: Mapping[str, object]) -> Table:
