@@ -10,6 +10,7 @@ import numpy as np
 from omsm_ros.cli.arguments import Arguments, cell_of, refuse_cell
 from omsm_ros.cli.command import LIMIT, CliCommand, Facts, table, written
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows, registration_of
+from omsm_ros.core.form.analyse import FormResult
 from omsm_ros.core.form.compensation import (
     CutSurface,
     check_last_cut,
@@ -30,16 +31,11 @@ from omsm_ros.core.surface.height_grid import gradient_of
 from omsm_ros.errors import ConfigurationError, DataError, FileError
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_limits, load_surface
-from omsm_ros.io.files import CURVES, DEVIATION, FORM, REPORT, save_bytes, save_text
+from omsm_ros.io.files import CURVES, DEVIATION, FORM, REPORT, atomic_file, save_bytes, save_text
 from omsm_ros.io.folders import FORM_FILES, MEASUREMENT_FILES, result_folder
 from omsm_ros.io.gcode_file import path_gcode as program_of
 from omsm_ros.messages import text_from
-from omsm_ros.pipelines.form import (
-    OpenedMeasurement,
-    RegistrationOptions,
-    judge_form,
-    open_measurement,
-)
+from omsm_ros.pipelines.form import judge_form, open_measurement
 from omsm_ros.quantities import (
     FEED,
     LENGTH,
@@ -143,64 +139,6 @@ _SIGN = (
     "add offset_m to the height of the surface that is cut, along z, positive away from the part; "
     "x and y are those of the nominal surface"
 )
-
-
-def compensate_form(
-    measured: OpenedMeasurement,
-    surface: Surface,
-    out: Path,
-    low_pass: float,
-    how: RegistrationOptions,
-    spiral: tuple[float, int] | None = None,
-    tool: tuple[float, float] | None = None,
-    previous: Path | None = None,
-) -> dict[str, Any]:
-    """Write compensation.csv into ``out``: offsets to add to the height of the next cut.
-
-    low_pass: cutoff, of which half is compensated [m]
-    spiral: feed per turn [m] and points per turn of the next cut, for compensation.nc; None: none
-    tool: radius of its nose [m] and spindle speed [rpm], for cut.nc, a complete program on that
-        spiral;  previous: compensation.csv of the cut that made this part
-
-    Raises DataError for a wavelength below the points, or if the previous cut went wrong.
-    """
-    form = measured.form(surface, how)
-    found = compensation(form.map, surface := form.registration.surface, low_pass)
-    (x, y), known = np.meshgrid(found.x, found.y), np.isfinite(found.offset)
-    share, total = None, found.offset
-    if previous is not None:
-        before, change = _offsets(previous, x, y)
-        share, total = check_last_cut(found, change), total + before
-    columns = (x, y, total, found.uncertainty, *([found.offset] if previous else []))
-    rows = zip(*(values[known].tolist() for values in columns), strict=True)
-    lines = (",".join(f"{value:.9g}" for value in row) for row in rows)
-    head = f"{_HEAD},change_m" if previous else _HEAD
-    save_text(out / COMPENSATION, "\n".join([head, *lines]) + "\n")
-    path: dict[str, Any] = {}
-    if spiral is not None:
-        along = spiral_offsets(found, *spiral)
-        save_text(out / PATH, path_gcode(along))
-        path = {"path": PATH, "path_places": len(along.offset), "path_left_out": along.left_out}
-    if spiral is not None and tool is not None:
-        cut, rim = CutSurface(surface, found.x, found.y, total), np.max(np.hypot(x, y)[known])
-        path |= _program(cut, float(rim), spiral[0], *tool, out)
-    offset, spread = np.abs(found.offset[known]), found.uncertainty[known]
-    sure = float(np.mean(offset > _COVERAGE * spread))
-    return path | {
-        "file": COMPENSATION,
-        "places": int(np.sum(known)),
-        "low_pass": low_pass,
-        "removed": list(form.registration.dofs.fitted),
-        "rms_before": found.before,
-        "rms_after": found.after,
-        "largest_offset": float(np.max(offset)),
-        "largest_uncertainty": float(np.max(spread)),
-        "significant_share": sure,
-        "last_cut": share,
-        "warnings": _warnings(sure, found.before, found.after),
-        "sign": _SIGN,
-        "not_evaluated": [] if measured.systematic else ["systematic errors of the measurement"],
-    }
 
 
 def _offsets(previous: Path, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -337,17 +275,53 @@ def _declare_compensate(add: Arguments) -> None:
 
 def _compensate(args: argparse.Namespace) -> Facts:
     surface = load_surface(args.nominal, args.fit)
-    spiral = (args.spiral, int(args.per_turn)) if args.spiral else None
-    tool = (args.tool_radius, args.rpm) if args.tool_radius else None
-    if tool and not spiral:
+    if args.tool_radius and not args.spiral:
         raise ConfigurationError("--tool-radius needs the feed of the cut: give --spiral FEED")
     with result_folder(args.out, (COMPENSATION, PATH, CUT)) as out:
         points = open_measurement(args.measured, args.unit, args.channel)
-        how = registration_of(args)
-        facts = compensate_form(
-            points, surface, out, args.low_pass, how, spiral, tool, args.previous
-        )
-    return {**facts, "out": str(args.out)}
+        form = points.form(surface, registration_of(args))
+        facts = _write_cut(form, args, out)
+    unknown = [] if points.systematic else ["systematic errors of the measurement"]
+    return {**facts, "sign": _SIGN, "not_evaluated": unknown, "out": str(args.out)}
+
+
+def _write_cut(form: FormResult, args: argparse.Namespace, out: Path) -> Facts:
+    """Write the offsets of the next cut, as a table, along a spiral, and as a whole program."""
+    surface = form.registration.surface
+    found = compensation(form.map, surface, args.low_pass)
+    (x, y), known = np.meshgrid(found.x, found.y), np.isfinite(found.offset)
+    share, total = None, found.offset
+    if args.previous is not None:
+        before, change = _offsets(args.previous, x, y)
+        share, total = check_last_cut(found, change), total + before
+    columns = (x, y, total, found.uncertainty, *([found.offset] if args.previous else []))
+    head = f"{_HEAD},change_m" if args.previous else _HEAD
+    with atomic_file(out / COMPENSATION, "w") as stream:
+        rows = np.column_stack([values[known] for values in columns])
+        np.savetxt(stream, rows, "%.9g", ",", header=head, comments="")
+    path: Facts = {}
+    if args.spiral:
+        along = spiral_offsets(found, args.spiral, int(args.per_turn))
+        save_text(out / PATH, path_gcode(along))
+        path = {"path": PATH, "path_places": len(along.offset), "path_left_out": along.left_out}
+    if args.tool_radius:
+        cut, rim = CutSurface(surface, found.x, found.y, total), np.max(np.hypot(x, y)[known])
+        path |= _program(cut, float(rim), args.spiral, args.tool_radius, args.rpm, out)
+    offset, spread = np.abs(found.offset[known]), found.uncertainty[known]
+    sure = float(np.mean(offset > _COVERAGE * spread))
+    return path | {
+        "file": COMPENSATION,
+        "places": int(np.sum(known)),
+        "low_pass": args.low_pass,
+        "removed": list(form.registration.dofs.fitted),
+        "rms_before": found.before,
+        "rms_after": found.after,
+        "largest_offset": float(np.max(offset)),
+        "largest_uncertainty": float(np.max(spread)),
+        "significant_share": sure,
+        "last_cut": share,
+        "warnings": _warnings(sure, found.before, found.after),
+    }
 
 
 def _show_compensate(facts: Facts) -> None:
