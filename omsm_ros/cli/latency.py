@@ -1,21 +1,33 @@
 """Commands that split a lag into structural dynamics and latency: selfcal, reversal, latency."""
 
 import argparse
+from dataclasses import replace
 from typing import Any
 
-from omsm_ros.cli.arguments import Arguments, cell_of, json_object, values_of
+from omsm_ros.cli.arguments import Arguments, cell_of, json_object
 from omsm_ros.cli.command import CliCommand, Facts, kept, rejected, table, written
-from omsm_ros.core.adjustment.resolved_calibration import undetermined
+from omsm_ros.core.adjustment.resolved_calibration import (
+    after_step_test,
+    from_scans_alone,
+    resolved,
+    reversal,
+    undetermined,
+    unit_calibration,
+    without_step_test,
+)
 from omsm_ros.core.adjustment.self_calibration import (
     DEFAULT_CLOCKING_RAD,
     DEFAULT_HARMONICS,
     UNINFORMATIVE_GAIN,
+    self_calibrate,
 )
 from omsm_ros.core.calibration.calibration import Calibration, excess_latency_text, with_latency
 from omsm_ros.core.calibration.latency import declared_latency, latency_summary
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.calibration_file import load_calibration
-from omsm_ros.pipelines.study_scans import reversal_of, self_calibration_of
+from omsm_ros.pipelines.adjust import read_scan
+from omsm_ros.pipelines.recording import Recording
+from omsm_ros.pipelines.study_scans import UNCORRECTED_LAG
 from omsm_ros.quantities import (
     ANGLE_UNCERTAINTY,
     GAIN,
@@ -43,9 +55,20 @@ def _declare_selfcal(add: Arguments) -> None:
 
 def _selfcal(args: argparse.Namespace) -> Facts:
     step_test = load_calibration(args.calibration) if args.calibration else None
-    names = ("harmonics", "clocking", "polarity", "static_gain", "gain_uncertainty", "settings")
     bags = [cell_of(path, args) for path in args.scans]
-    found, made, accounts = self_calibration_of(bags, step_test, **values_of(args, *names))
+    with Recording(bags[0]) as first:
+        period = first.sample_period()
+    base = step_test or unit_calibration(period, args.static_gain)
+    how = replace(UNCORRECTED_LAG, polarity=args.polarity)
+    scans = [read_scan(bag, base, how) for bag in bags]
+    prior = after_step_test(base) if step_test else without_step_test(args.gain_uncertainty)
+    prior = replace(prior, clocking=args.clocking)
+    found = self_calibrate([scan.data for scan in scans], prior, args.harmonics)
+    made = (
+        resolved(step_test, found)
+        if step_test
+        else from_scans_alone(found, period, args.static_gain, args.settings)
+    )
     path = kept(args.out, made)
     return {
         **_resolved_facts(made),
@@ -54,7 +77,7 @@ def _selfcal(args: argparse.Namespace) -> Facts:
         "disagreement": found.agreement.disagreement,
         "unidentifiable": [*map(str, undetermined(found))],
         "speeds_rpm": [speed / RPM_RAD_S for speed in found.speeds],
-        "samples": [account.as_dict() for account in accounts],
+        "samples": [scan.account.as_dict() for scan in scans],
         "calibration": str(path),
     }
 
@@ -107,14 +130,15 @@ def _declare_reversal(add: Arguments) -> None:
 
 def _reversal(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
-    bags = [cell_of(path, args) for path in (args.clockwise, args.counterclockwise)]
-    found, accounts = reversal_of(bags, calibration)
+    paths = args.clockwise, args.counterclockwise
+    scans = [read_scan(cell_of(path, args), calibration, UNCORRECTED_LAG) for path in paths]
+    found = reversal([scan.data for scan in scans], calibration)
     facts = {
         name: getattr(found, name)
         for name in ("lag", "uncertainty", "lag_of_z", "residual", "used", "latency")
     }
-    facts["points"] = sum(account.axes.corrected for account in accounts)
-    facts["samples"] = [account.as_dict() for account in accounts]
+    facts["points"] = sum(scan.account.axes.corrected for scan in scans)
+    facts["samples"] = [scan.account.as_dict() for scan in scans]
     if args.out:
         facts["calibration"] = str(kept(args.out, found.calibration))
     return facts
