@@ -148,21 +148,25 @@ def _radius(args: argparse.Namespace, nominal: Surface) -> float:
 def _plan_scans(args: argparse.Namespace) -> Facts:
     # Here, because a step test needs nothing of what adjusts scans.
     from omsm_ros.core.adjustment import ScanDesign
-    from omsm_ros.pipelines.plan_scans import plan_facts, planned_sets
+    from omsm_ros.pipelines.plan_scans import planned_set
 
     nominal = _nominal(args)
     first = ScanDesign(rpm=args.rpm, start=_radius(args, nominal), end=0.0, pitch=args.feed)
-    sets = planned_sets(
-        first, nominal, load_sources(args.sources), args.accuracy, load_limits(args.limits)
-    )
-    return plan_facts(
-        sets, args.accuracy, args.out, nominal, args.dialect, args.path_error, args.servo_period
-    )
+    stated, limits = load_sources(args.sources), load_limits(args.limits)
+    designs, facts = planned_set(first, nominal, stated, args.accuracy, limits)
+    return {**facts, **_programs(args, designs, nominal)}
+
+
+def _programs(args: argparse.Namespace, designs: Sequence[Any], nominal: Surface) -> Facts:
+    from omsm_ros.pipelines.plan_scans import write_scans
+
+    how = args.path_error, args.servo_period, args.dialect
+    return write_scans(designs, nominal, args.out, *how)
 
 
 def _plan_motion(args: argparse.Namespace) -> Facts:
     from omsm_ros.core.adjustment import ScanDesign
-    from omsm_ros.pipelines.plan_scans import refuse_beyond, write_scans
+    from omsm_ros.pipelines.plan_scans import refuse_beyond
 
     nominal = _nominal(args)
     modes = [(frequency, 0.0) for frequency in args.mode]
@@ -178,16 +182,13 @@ def _plan_motion(args: argparse.Namespace) -> Facts:
         rpm=best.rpm, start=_radius(args, nominal), end=0.0, pitch=best.feed, rate=best.rate
     )
     refuse_beyond(design, nominal, load_limits(args.limits), args.accuracy)
-    programs = write_scans(
-        [design], nominal, args.out, args.path_error, args.servo_period, args.dialect
-    )
     rows = [{**asdict(one), "score": one.score} for one in (asked, best)]
     return {
         "motion": [{k: v if np.isfinite(v) else None for k, v in row.items()} for row in rows],
         "modes": modes,
         "orders": orders.tolist(),
         "duration": design.duration,
-        **programs,
+        **_programs(args, [design], nominal),
     }
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.adjustment import PlannedSet, ScanDesign, plan_scans, usual_sets
+from omsm_ros.core.adjustment import ScanDesign, plan_scans, usual_sets
 from omsm_ros.core.correction.machine_sources import MachineSources
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.kinematics.limits import MachineLimits, speed_limits
@@ -71,41 +71,25 @@ def exceeded_limits(
     return exceeded
 
 
-def planned_sets(
-    first: ScanDesign,
-    nominal: Surface,
-    stated: MachineSources,
-    accuracy: float,
+def planned_set(
+    first: ScanDesign, nominal: Surface, stated: MachineSources, accuracy: float,
     limits: MachineLimits,
-) -> tuple[PlannedSet, ...]:
-    """Return the sets of scans that the machine can make, the shortest that reaches first.
+) -> tuple[tuple[ScanDesign, ...], dict[str, Any]]:  # fmt: skip
+    """Return the shortest set of scans that reaches the accuracy, and what each set would reach.
 
     first: a scan that the machine can make;  accuracy: asked for, k = 2 [m]
 
     Raises ConfigurationError where the first scan exceeds a limit of the machine.
     """
     refuse_beyond(first, nominal, limits, accuracy)
-    sets = {
+    possible = {
         name: designs
         for name, designs in usual_sets(first).items()
         if not any(exceeded_limits(design, nominal, limits, accuracy) for design in designs)
     }
-    return plan_scans(sets, priors_of(stated), nominal, accuracy)
-
-
-def plan_facts(
-    sets: Sequence[PlannedSet],
-    accuracy: float,
-    out: Path,
-    nominal: Surface,
-    dialect: str,
-    bound: float,
-    cycle: float,
-) -> dict[str, Any]:
-    """Write the programs of the best set into ``out`` by :func:`write_scans`; return the facts."""
+    sets = plan_scans(possible, priors_of(stated), nominal, accuracy)
     best = sets[0]
-    return {
-        **write_scans(best.designs, nominal, out, bound, cycle, dialect),
+    return best.designs, {
         "set": best.name,
         "reaches": best.reaches,
         "accuracy": accuracy,
@@ -127,8 +111,8 @@ def _path_entry(path: PlannedPath, design: ScanDesign, nominal: Surface) -> dict
     found = {f: getattr(path, f) for f in ("error", "rms", "segment", "c_acceleration")}
     if isinstance(nominal, BoundedSurface):
         time = np.arange(0.0, design.duration, 1 / design.rate, dtype=np.float64)
-        x = design.start + (design.end - design.start) * time / design.duration
-        place = x * np.exp(-1j * (design.rpm * RPM_RAD_S * time + design.clocking))
+        x, _, c = scan_path(design, nominal, time)
+        place = x * np.exp(-1j * (c + design.clocking))
         found["points"] = int(np.count_nonzero(nominal.aperture.holds(place.real, place.imag)))
     return found
 

@@ -53,7 +53,8 @@ def counters(bag):
 @REAL
 def test_a_program_is_executed_as_planned_and_no_cycle_is_lost(tmp_path):
     design = ScanDesign(rpm=60.0, start=2e-3, end=1e-3, pitch=2e-4)
-    (path,) = write_scans([design], PAPER_MIRROR, tmp_path, 1e-7, 1e-3)
+    write_scans([design], PAPER_MIRROR, tmp_path, 1e-7, 1e-3)
+    path, _ = scan_program(design, PAPER_MIRROR, 1e-7, 1e-3)
     counts = demo.run(tmp_path / "scan_1.nc", tmp_path / "command.mcap")
     assert counts.get("lost", 0) == counts.get("overruns", 0) == 0
     assert counts["samples"] == counts["decoded"] > 5000
