@@ -21,6 +21,7 @@ from omsm_ros.cli.arguments import (
 from omsm_ros.cli.command import CliCommand, Facts, kept, output_path_for, rejected, table, written
 from omsm_ros.core.calibration.calibration import FURTHER_AXES, Calibration
 from omsm_ros.core.calibration.certificate import NOTE, Origin, from_json, of_severity
+from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse, use_of_motion
 from omsm_ros.core.estimation.equivalent_time import fast_mode
 from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, HOLDS
 from omsm_ros.core.estimation.preparation import joined_recordings
@@ -37,19 +38,11 @@ from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.descriptions import load_multisine
-from omsm_ros.io.files import atomic_file
+from omsm_ros.io.files import atomic_file, save_text
+from omsm_ros.io.folders import result_folder
 from omsm_ros.pipelines.history import keep_calibration, record_in_catalogue
-from omsm_ros.pipelines.identify import (
-    intended_use_of,
-    load_model,
-    record_of_motion,
-    record_of_table,
-    save_model,
-    text_of_run,
-    write_certificate,
-    write_model_page,
-)
-from omsm_ros.pipelines.recording import Recording
+from omsm_ros.pipelines.identify import load_model, record_of_table, save_model, write_certificate
+from omsm_ros.pipelines.recording import Recording, scan_path_of
 from omsm_ros.quantities import (
     DURATION,
     MAX_DELAY_SAMPLES,
@@ -58,10 +51,10 @@ from omsm_ros.quantities import (
     UNCERTAINTY,
     shown,
 )
-from omsm_ros.readable import count, percent, plain, quantity, standard
+from omsm_ros.readable import count, now_text, percent, plain, quantity, standard
 from omsm_ros.report.verdict import verdict_text
 
-ENCODER = "encoder"
+ENCODER, MODEL_PAGE = "encoder", "model.html"
 _MAX_DELAY = 3
 
 
@@ -102,14 +95,16 @@ def _identify(args: argparse.Namespace) -> Facts:
     stated = {name: value for name, value in args.origin.items() if name not in PART_ENTRIES}
     motions, settings, recorded = _motions(args, further)
     if args.hold != BAND_LIMITED:
-        records = [record_of_motion(motion) for motion in motions]
+        records = [
+            SampledRecord(motion.z[:, np.newaxis], motion.distance, motion.ok) for motion in motions
+        ]
         return _model_facts(records, motions[0].sample_period, args)
     identified = identify(
         joined_recordings(motions),
         order=args.order,
         input=source,
         settings=settings,
-        use=intended_use_of(args.scan, args.accuracy),
+        use=_intended_use(args),
         origin=replace(
             from_json(Origin, stated, "origin"),
             recorded_ns=recorded,
@@ -137,6 +132,13 @@ def _identify(args: argparse.Namespace) -> Facts:
         page = write_certificate(args.report, identified, source=first.name)
         facts["report"] = str(page)
     return facts
+
+
+def _intended_use(args: argparse.Namespace) -> IntendedUse:
+    if args.scan is None:
+        return replace(PAPER_USE, accuracy_m=args.accuracy)
+    path = scan_path_of(args.scan)
+    return use_of_motion(path.z, path.sample_period, args.accuracy)
 
 
 def _with_multisine(
@@ -283,8 +285,17 @@ def _model_facts(
 
 
 def _drawn(out: Path, model: SampledModel, record: SampledRecord, source: Path) -> str:
+    # Imported on demand, because loading the figures takes a second.
+    from omsm_ros.report.certificate.figures import model_figures_of
+    from omsm_ros.report.certificate.page import render_model
+    from omsm_ros.report.page_parts import Issue
+
     run = free_run(model, record.inputs, record.output, record.used)
-    return str(write_model_page(out, model, record, run, source=source.name))
+    figures = model_figures_of(model, record.inputs, record.output, run)
+    issue = Issue(date=now_text(), source=source.name, version=__version__, figures=figures)
+    with result_folder(out, (MODEL_PAGE,)) as folder:
+        save_text(folder / MODEL_PAGE, render_model(model, run, issue))
+    return str(out / MODEL_PAGE)
 
 
 def calibration_facts(calibration: Calibration) -> Facts:
@@ -380,7 +391,11 @@ def _validate(args: argparse.Namespace) -> Facts:
     with ExitStack() as both:  # if one output cannot be written, neither is kept
         if args.out is not None:
             stream = both.enter_context(atomic_file(args.out, "w"))
-            stream.write(text_of_run(record, run, model.sections.period))
+            time = model.sections.period * np.arange(len(record))
+            names = [f"input_{i}" for i in range(1, 1 + len(inputs))] if inputs[1:] else ["input"]
+            head = ",".join(["time_s", *names, "output", "model"])
+            rows = np.column_stack([time, record.inputs, record.output, run.output])
+            np.savetxt(stream, rows, "%.12g", ",", header=head, comments="")
             facts["run"] = str(args.out)
         if args.report is not None:
             facts["report"] = _drawn(args.report, model, record, args.record)

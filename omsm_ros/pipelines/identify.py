@@ -1,41 +1,23 @@
-"""Identify sampled models from tables and bags; write certificates and pages of models."""
+"""Read tables to identify sampled models from, and models; write certificates."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from omsm_ros import __version__
-from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse, use_of_motion
 from omsm_ros.core.estimation.parallel_sections import HOLDS
 from omsm_ros.core.estimation.sampled_fit import SampledRecord
-from omsm_ros.core.estimation.sampled_model import SCHEMA, SCHEMA_1, FreeRun, SampledModel
+from omsm_ros.core.estimation.sampled_model import SCHEMA, SCHEMA_1, SampledModel
 from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import Identification
-from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import CalibrationError, DataError, FileError, named_errors
-from omsm_ros.io.files import load_object, save_bytes, save_json
+from omsm_ros.io.files import load_object, save_json, save_text
 from omsm_ros.io.folders import result_folder
 from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
 from omsm_ros.io.tables.text_table import PLAIN, TextTable, load_columns
-from omsm_ros.pipelines.recording import scan_path_of
 from omsm_ros.readable import now_text, quantity
 from omsm_ros.units import seconds_of
-
-
-def intended_use_of(scan: Path | None, accuracy: float | None) -> IntendedUse:
-    """Return the intended use: a scan, as a bag or a plan in CSV, and the required accuracy [m].
-
-    scan: None for the paper's
-
-    Raises FileError, BagError or ConfigurationError.
-    """
-    if scan is None:
-        return replace(PAPER_USE, accuracy_m=accuracy)
-    path = scan_path_of(scan)
-    return use_of_motion(path.z, path.sample_period, accuracy)
-
 
 # Ten times the difference between the clocks of two computers.
 _PERIOD_TOLERANCE = 5e-3
@@ -87,22 +69,7 @@ def _check_time(path: Path, period: float) -> None:
             )
 
 
-def record_of_motion(motion: MotionRecord) -> SampledRecord:
-    """Return the position of Z [m] as input and the probe's distance [m] as output."""
-    return SampledRecord(motion.z[:, np.newaxis], motion.distance, motion.ok)
-
-
-def text_of_run(record: SampledRecord, run: FreeRun, period: float) -> str:
-    """Return time, inputs, output and the model's output as CSV."""
-    rows = np.column_stack([period * np.arange(len(record)), record.inputs, record.output])
-    rows = np.column_stack([rows, run.output])
-    names = [f"input_{i}" for i in range(1, record.inputs.shape[1] + 1)]
-    head = ["time_s", *(names if len(names) > 1 else ["input"]), "output", "model"]
-    lines = [",".join(f"{value:.12g}" for value in row) for row in rows.tolist()]
-    return "\n".join([",".join(head), *lines]) + "\n"
-
-
-PAGE, DCC, MODEL_PAGE = "certificate.html", "certificate_dcc.xml", "model.html"
+PAGE, DCC = "certificate.html", "certificate_dcc.xml"
 
 
 def write_certificate(out: Path, identified: Identification, *, source: str = "") -> Path:
@@ -120,28 +87,9 @@ def write_certificate(out: Path, identified: Identification, *, source: str = ""
     figures = certificate_figures_of(calibration, fitted_record(identified))
     issue = Issue(date=now_text(), source=source, version=__version__, figures=figures)
     with result_folder(out, (PAGE, DCC)) as folder:
-        save_bytes(folder / DCC, render_dcc(calibration, __version__).encode("utf-8", "replace"))
-        save_bytes(folder / PAGE, render(calibration, issue).encode("utf-8", "replace"))
+        save_text(folder / DCC, render_dcc(calibration, __version__))
+        save_text(folder / PAGE, render(calibration, issue))
     return out / PAGE
-
-
-def write_model_page(
-    out: Path, model: SampledModel, record: SampledRecord, run: FreeRun, *, source: str = ""
-) -> Path:
-    """Write model.html into ``out``: the model, and its ``run`` over ``record``; return its path.
-
-    source: name of the record, as the page states it
-    """
-    # Imported on demand, because loading the figures takes a second.
-    from omsm_ros.report.certificate.figures import model_figures_of
-    from omsm_ros.report.certificate.page import render_model
-    from omsm_ros.report.page_parts import Issue
-
-    figures = model_figures_of(model, record.inputs, record.output, run)
-    issue = Issue(date=now_text(), source=source, version=__version__, figures=figures)
-    with result_folder(out, (MODEL_PAGE,)) as folder:
-        save_bytes(folder / MODEL_PAGE, render_model(model, run, issue).encode("utf-8", "replace"))
-    return out / MODEL_PAGE
 
 
 _MAX_BYTES = 8_000_000
