@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from omsm_ros.cli.arguments import Arguments
 from omsm_ros.cli.command import CliCommand, Facts, say, table, written
@@ -15,9 +14,6 @@ from omsm_ros.io.json_and_yaml import unknown_as_null
 from omsm_ros.quantities import shown
 from omsm_ros.readable import NOTHING, count, measured, plain, quantity
 from omsm_ros.units import DAY_S
-
-if TYPE_CHECKING:  # loading the catalogue takes long
-    from omsm_ros.pipelines.history import MachineHistory
 
 _SHOWN_ROWS = 20
 _MOST_DRAWN = 30
@@ -62,22 +58,15 @@ def _history(args: argparse.Namespace) -> Facts:
         "added": added,
         **({"figure": str(args.plot)} if args.plot is not None else {}),
         "older": older,
-        "machines": [_plain(machine) for machine in machines],
+        "machines": [_with_times_as_text(machine) for machine in machines],
     }
 
 
-def _plain(machine: MachineHistory) -> dict[str, Any]:
-    """Return a machine for JSON, its times as text."""
-    # asdict() of the whole would copy every value of every row.
-    facts = {field.name: getattr(machine, field.name) for field in fields(machine)}
-    facts = {name: asdict(part) if is_dataclass(part) else part for name, part in facts.items()}
-    for rows in (machine.calibrations, machine.measurements):
-        for row in rows:
-            for name in ("recorded_at", "added_at"):
-                row[name] = row[name] and row[name].isoformat(timespec="seconds")
-    plain = unknown_as_null(facts)
-    assert plain is not None
-    return plain
+def _with_times_as_text(machine: Facts) -> Facts | None:
+    for row in (*machine["calibrations"], *machine["measurements"]):
+        for name in ("recorded_at", "added_at"):
+            row[name] = row[name] and row[name].isoformat(timespec="seconds")
+    return unknown_as_null(machine)
 
 
 def _show_history(facts: Facts) -> None:

@@ -6,7 +6,7 @@ import hashlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.calibration.repeatability import LinearTrend, trend
+from omsm_ros.core.calibration.repeatability import trend
 from omsm_ros.errors import ConfigurationError, FileError, OmsmError
 from omsm_ros.io import bags, json_and_yaml
 from omsm_ros.io.calibration_file import load_calibration
@@ -293,27 +293,13 @@ def keep(address: str, path: Path) -> bool:
     return keep_calibration(address, load_calibration(path), path)
 
 
-@dataclass(frozen=True, slots=True)
-class MachineHistory:
-    """Calibrations and measurements of one machine, and their linear trends.
-
-    delay: trend of the lag [s/s];  static_gain: [1/s];  deviation: of the form's rms [m/s]; None
-    for fewer than five rows
-    """
-
-    machine: str
-    calibrations: list[dict[str, Any]]
-    measurements: list[dict[str, Any]]
-    delay: LinearTrend | None
-    static_gain: LinearTrend | None
-    deviation: LinearTrend | None
-
-
-def history(address: str, machine: str = "") -> tuple[list[MachineHistory], int]:
+def history(address: str, machine: str = "") -> tuple[list[dict[str, Any]], int]:
     """Return the contents of the catalogue by machine; of one machine, or of all.
 
-    Also return the number of calibrations and measurements that are older than those listed; zero
-    unless a table holds more than ``MOST_ROWS``.
+    Of each its name, its ``calibrations`` and ``measurements``, and linear trends of the lag,
+    ``delay`` [s/s], of ``static_gain`` [1/s] and of the form's rms, ``deviation`` [m/s]; None for
+    fewer than five rows. Also return the number of calibrations and measurements that are older
+    than those listed; zero unless a table holds more than ``MOST_ROWS``.
     """
     older = 0
     rows: dict[str, dict[str, list[dict[str, Any]]]] = {}
@@ -327,19 +313,20 @@ def history(address: str, machine: str = "") -> tuple[list[MachineHistory], int]
                 rows.setdefault(name, {table: [] for table in _TABLES})[table].append(row)
     machines = []
     for name in sorted(rows):
-        calibrations, measurements = rows[name].values()
-        accepted = [row for row in calibrations if row["verdict"] != "rejected"]
-        trends = [_trend(accepted, column) for column in ("delay", "static_gain")]
-        trends.append(_trend(measurements, "deviation_rms"))
-        machines.append(MachineHistory(name, calibrations, measurements, *trends))
+        found = rows[name]
+        accepted = [row for row in found["calibrations"] if row["verdict"] != "rejected"]
+        trends = {column: _trend(accepted, column) for column in ("delay", "static_gain")}
+        trends["deviation"] = _trend(found["measurements"], "deviation_rms")
+        machines.append({"machine": name, **found, **trends})
     return machines, older
 
 
-def _trend(rows: list[dict[str, Any]], name: str) -> LinearTrend | None:
+def _trend(rows: list[dict[str, Any]], name: str) -> dict[str, float] | None:
     when = [row["recorded_at"] for row in rows]
     times = [np.nan if t is None else (t - datetime(1970, 1, 1)).total_seconds() for t in when]
     values = [np.nan if row[name] is None else row[name] for row in rows]
-    return trend(np.array(times, np.float64), np.array(values, np.float64))
+    found = trend(np.array(times, np.float64), np.array(values, np.float64))
+    return found and asdict(found)
 
 
 def _machine(settings: Mapping[str, object]) -> str:

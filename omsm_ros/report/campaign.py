@@ -214,18 +214,18 @@ def _figure(measurements: Sequence[CampaignEntry], judged: Sequence[JudgedSeries
 _COLOURS = (style.AFTER, style.BEFORE, "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
-def draw(machines: Sequence[Any]) -> bytes:
+def draw(machines: Sequence[Mapping[str, Any]]) -> bytes:
     """Draw lag, gain and form over time (PNG), a colour per machine; crosses are rejected."""
     made, axes = style.figure(10.0, 7.0, rows=3, sharex=True)
     lag, gain, form = axes[:, 0]
     for i, machine in enumerate(machines):
         colour = _COLOURS[i % len(_COLOURS)]
         for rejected, mark in ((False, "o"), (True, "x")):
-            rows = [r for r in machine.calibrations if (r["verdict"] == "rejected") == rejected]
+            rows = [r for r in machine["calibrations"] if (r["verdict"] == "rejected") == rejected]
             _points(lag, rows, "delay", "delay_uncertainty", MICROSECOND_S, colour, mark)
             _points(gain, rows, "static_gain", "static_gain_uncertainty", 1.0, colour, mark)
-        _points(form, machine.measurements, "deviation_rms", "", NANOMETRE_M, colour, ".")
-        lag.plot([], [], "o", color=colour, label=style.named(machine.machine) or "not named")
+        _points(form, machine["measurements"], "deviation_rms", "", NANOMETRE_M, colour, ".")
+        lag.plot([], [], "o", color=colour, label=style.named(machine["machine"]) or "not named")
     style.label(lag, y="µs", title="Low-frequency delay, k = 2")
     style.label(gain, title="Static gain, k = 2")
     style.label(form, y="nm", title="Form deviation, rms", x="recorded (UTC)")

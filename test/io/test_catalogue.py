@@ -85,7 +85,7 @@ def test_of_more_rows_than_are_listed_the_newest_are_and_the_others_counted(
                 f"'2026-0{k}-01 00:00:00.000000', 'm{k % 2}', {rest} FROM calibrations LIMIT 1"
             )
     found = history(address)
-    listed = [row["id"] for machine in found[0] for row in machine.calibrations]
+    listed = [row["id"] for machine in found[0] for row in machine["calibrations"]]
     assert (listed, found[1]) == (["c4", "c3", "c5"], 2)
     assert history(address, "m0")[1] == 0
     assert cli.main(["history", "--catalogue", address]) == 0

@@ -123,7 +123,7 @@ def test_a_name_is_a_name_and_no_statement(tmp_path, address, true_calibration, 
         made = replace(true_calibration, settings={"machine": name, "k": k})
         keep_calibration(address, made, tmp_path / "cal.json")
     found = history(address, machine)[0]
-    assert [m.machine for m in found] == ([machine] if machine else ["", "other"])
+    assert [m["machine"] for m in found] == ([machine] if machine else ["", "other"])
     assert len(rows(address, "calibrations")) == 2
 
 

@@ -119,12 +119,12 @@ def test_two_writers_and_a_server_that_goes_away(server, tmp_path, true_calibrat
     ]
     assert [writer.wait() for writer in writers] == [0, 0]
     (machine,) = history(server.address)[0]
-    assert len({row["folder"] for row in machine.measurements}) == 20
+    assert len({row["folder"] for row in machine["measurements"]}) == 20
 
     assert keep_calibration(server.address, true_calibration, tmp_path / "cal.json")
     assert not keep_calibration(server.address, true_calibration, tmp_path / "cal.json")
-    (twin,) = [m for m in history(server.address)[0] if m.machine == "twin"]
-    assert twin.calibrations[0]["delay"] == true_calibration.dynamics.low_frequency_delay
+    (twin,) = [m for m in history(server.address)[0] if m["machine"] == "twin"]
+    assert twin["calibrations"][0]["delay"] == true_calibration.dynamics.low_frequency_delay
 
     server.stop()
     begin = time.monotonic()

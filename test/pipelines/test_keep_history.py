@@ -11,6 +11,7 @@ from datetime import datetime
 import pytest
 
 from omsm_ros import cli
+from omsm_ros.core.calibration.repeatability import LinearTrend
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.io import bags, calibration_file
 from omsm_ros.io.bag_writer import BagWriter
@@ -56,10 +57,10 @@ def test_repeated_statements_are_listed_once(tmp_path, address, true_calibration
     assert keep(address, folder)
     assert not keep(address, path)
     assert not keep(address, folder)
-    (twin, lathe) = sorted(history(address)[0], key=lambda m: len(m.measurements))
-    assert [row["id"] for row in twin.calibrations] == [true_calibration.id]
-    assert lathe.machine == "lathe 1"
-    (row,) = lathe.measurements
+    (twin, lathe) = sorted(history(address)[0], key=lambda m: len(m["measurements"]))
+    assert [row["id"] for row in twin["calibrations"]] == [true_calibration.id]
+    assert lathe["machine"] == "lathe 1"
+    (row,) = lathe["measurements"]
     assert (row["received"], row["corrected"], row["deviation_rms"]) == (100, 98, 17e-9)
     assert row["dynamic_error_rms"] is None
 
@@ -67,7 +68,7 @@ def test_repeated_statements_are_listed_once(tmp_path, address, true_calibration
 def test_a_row_holds_what_its_calibration_says(tmp_path, address, true_calibration):
     keep_calibration(address, true_calibration, tmp_path / "cal.json")
     (machine,) = history(address)[0]
-    (row,) = machine.calibrations
+    (row,) = machine["calibrations"]
     assert row["delay"] == pytest.approx(true_calibration.dynamics.low_frequency_delay)
     assert row["static_gain"] == true_calibration.static_gain
     assert row["verdict"].startswith("accepted")
@@ -91,12 +92,12 @@ def test_drift_of_a_machine_is_found_over_days(
         calibration = aged(true_calibration, 1e-6 * day)
         keep_calibration(address, calibration, tmp_path / f"{day}.json", bag)
     (machine,) = history(address, "lathe 1")[0]
-    assert [row["recorded_at"] for row in machine.calibrations] == [
+    assert [row["recorded_at"] for row in machine["calibrations"]] == [
         datetime(2026, 1, day + 1) for day in range(8)
     ]
-    assert machine.delay.slope * 86_400 == pytest.approx(1e-6, rel=1e-6)
-    assert machine.delay.significant
-    assert machine.deviation is None
+    assert machine["delay"]["slope"] * 86_400 == pytest.approx(1e-6, rel=1e-6)
+    assert LinearTrend(**machine["delay"]).significant
+    assert machine["deviation"] is None
     assert history(address, "lathe 2")[0] == []
 
 
@@ -129,7 +130,7 @@ def test_two_writers_at_once_lose_nothing(tmp_path, address):
             assert keep_measurement(address, tmp_path / "b" / str(i))
     assert other.returncode == 0
     (machine,) = history(address)[0]
-    assert len({row["folder"] for row in machine.measurements}) == 20
+    assert len({row["folder"] for row in machine["measurements"]}) == 20
 
 
 # Databases that fail.

@@ -156,14 +156,14 @@ def calibrated(k, verdict="accepted", delay=3.4e-4):
 
 def test_each_machine_has_its_colour_and_a_rejected_calibration_is_a_cross(drawn):
     machines = [
-        SimpleNamespace(
-            machine="one $x$",
-            calibrations=[calibrated(0), calibrated(1, "rejected", 5e-4),
-                          calibrated(2, delay=None)],
-            measurements=[{"deviation_rms": 21e-9, "recorded_at": None,
-                           "added_at": datetime(2026, 2, 3)}],
-        ),
-        SimpleNamespace(machine="", calibrations=[calibrated(3)], measurements=[]),
+        {
+            "machine": "one $x$",
+            "calibrations": [calibrated(0), calibrated(1, "rejected", 5e-4),
+                             calibrated(2, delay=None)],
+            "measurements": [{"deviation_rms": 21e-9, "recorded_at": None,
+                              "added_at": datetime(2026, 2, 3)}],
+        },
+        {"machine": "", "calibrations": [calibrated(3)], "measurements": []},
     ]  # fmt: skip
     png = campaign.draw(machines)
     assert imread(io.BytesIO(png)).shape[2] == 4

@@ -40,7 +40,7 @@ def test_a_certificate_is_filed_of_every_identification(cell):
         assert ("written into the catalogue" in reply.message) == success
     pytest.importorskip("sqlalchemy", reason="SQLAlchemy is an optional package")
     (machine,) = history(base)[0]
-    (row,) = machine.calibrations
+    (row,) = machine["calibrations"]
     assert (row["path"], row["source"]) == (str(output.resolve()), bag)
 
 
