@@ -1,6 +1,6 @@
 """Pages to file, each HTML in one piece: certificate of a calibration, and a sampled model."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,8 @@ from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.readable import NOTHING, count, measured, percent, plain, probability, quantity
 from omsm_ros.report.certificate import figures as drawn
 from omsm_ros.report.certificate import tables
-from omsm_ros.report.certificate.tables import known_rows
 from omsm_ros.report.page_parts import Headline, Issue, Section, fill, picture, present, title_block
-from omsm_ros.report.tables import Table, latency_text, mapping_table, part
+from omsm_ros.report.tables import Table, known_rows, latency_text, mapping_table, part
 from omsm_ros.report.verdict import PageVerdict, verdict_text
 from omsm_ros.units import DEGREE_RAD, PPM
 
@@ -29,35 +28,48 @@ _CLOSING = (
 def render(calibration: Calibration, issue: Issue) -> str:
     """Return the page as HTML; all text from outside is escaped."""
     origin = calibration.certificate.origin
-    return fill(
-        "certificate.html",
+    return _page(
+        issue,
+        calibration.id[:16],
         heading="Calibration certificate",
-        issued=issue.line(calibration.id[:16]),
         closing=f"{_CLOSING} Calibration {calibration.id}.",
-        figures=issue.figures,
         verdict=verdict_on_calibration(calibration),
         headlines=headlines(calibration),
         sections=sections(calibration, issue),
         block=title_block(to_json(origin)),
         signer=origin.operator or "",
+        caption=drawn.CAPTIONS.__getitem__,
+    )
+
+
+def _page(issue: Issue, identity: str = "", **content: object) -> str:
+    return fill(
+        "certificate.html",
+        issued=issue.line(identity),
+        figures=issue.figures,
         band=drawn.BAND,
         picture=lambda name: picture(issue.figures[name]),
-        caption=drawn.CAPTIONS.__getitem__,
+        **content,
     )
 
 
 def verdict_on_calibration(calibration: Calibration) -> PageVerdict:
     """Return the verdict of the certificate, and its reasons."""
     certificate = calibration.certificate
-    reasons = tuple(map(str, certificate.reasons))
-    if certificate.verdict == REJECTED:
-        return PageVerdict("bad", "Rejected", reasons or ("no reason is given",))
-    if certificate.verdict is None:
-        return PageVerdict("unknown", "Not judged", ("the calibration has no certificate",))
-    kept = tuple(map(str, certificate.reservations))
-    stated = verdict_text(calibration)
-    grounds = (*reasons, *kept, *_verdict_reasons(calibration))
-    return PageVerdict("care" if kept else "good", stated[:1].upper() + stated[1:], grounds)
+    reasons, kept = ([*map(str, n)] for n in (certificate.reasons, certificate.reservations))
+    if certificate.verdict in (REJECTED, None):
+        return _verdict(certificate.verdict, reasons, False, "calibration")
+    grounds = [*reasons, *kept, *_verdict_reasons(calibration)]
+    return _verdict(verdict_text(calibration), grounds, bool(kept), "calibration")
+
+
+def _verdict(stated: str | None, grounds: Sequence[str], doubt: bool, what: str) -> PageVerdict:
+    """Return a ``stated`` verdict for the page;  doubt: there are reservations."""
+    if stated == REJECTED:
+        return PageVerdict("bad", "Rejected", tuple(grounds) or ("no reason is given",))
+    if not stated:
+        return PageVerdict("unknown", "Not judged", (f"the {what} has no certificate",))
+    return PageVerdict("care" if doubt else "good", stated[:1].upper() + stated[1:], tuple(grounds))
 
 
 def _verdict_reasons(calibration: Calibration) -> list[str]:
@@ -261,17 +273,13 @@ _CLOSING_OF_MODEL = (
 
 def render_model(model: SampledModel, run: FreeRun, issue: Issue) -> str:
     """Return the page of a model and its ``run`` as HTML; all text from outside is escaped."""
-    return fill(
-        "certificate.html",
+    return _page(
+        issue,
         heading="Model",
-        issued=issue.line(),
         closing=_CLOSING_OF_MODEL,
-        figures=issue.figures,
         verdict=verdict_on_model(model),
         headlines=_model_headlines(model, run),
         sections=_model_sections(model, issue),
-        band=drawn.BAND,
-        picture=lambda name: picture(issue.figures[name]),
         caption=drawn.CAPTIONS_OF_MODEL.__getitem__,
     )
 
@@ -279,13 +287,8 @@ def render_model(model: SampledModel, run: FreeRun, issue: Issue) -> str:
 def verdict_on_model(model: SampledModel) -> PageVerdict:
     """Return the model's own verdict, and why."""
     stated = str(model.certificate.get("verdict", ""))
-    reasons, warnings = (tables.texts(model.certificate, name) for name in ("reasons", "warnings"))
-    if stated == REJECTED:
-        return PageVerdict("bad", "Rejected", tuple(reasons) or ("no reason is given",))
-    if not stated:
-        return PageVerdict("unknown", "Not judged", ("the model has no certificate",))
-    level = "care" if warnings else "good"
-    return PageVerdict(level, stated[:1].upper() + stated[1:], tuple(warnings))
+    grounds = tables.texts(model.certificate, "reasons" if stated == REJECTED else "warnings")
+    return _verdict(stated, grounds, bool(grounds), "model")
 
 
 def _model_headlines(model: SampledModel, run: FreeRun) -> list[Headline]:
@@ -314,10 +317,10 @@ def _model_sections(model: SampledModel, issue: Issue) -> list[Section]:
     ]
     stated = part(certificate, "limits")
     limits = tables.limit_rows(stated if isinstance(stated, Mapping) else {})
-    judged_by = Table("Limits of the verdict", (), known_rows(limits, 1))
+    judged_by = Table("Limits of the verdict", (), known_rows(limits))
     shown = (drawn.RECORD, drawn.CORRELATION)
     every = [
-        Section("Record", shown, (Table("", (), known_rows(tests, 1)),)),
+        Section("Record", shown, (Table("", (), known_rows(tests)),)),
         Section("Poles", (), (_model_poles(certificate),)),
         Section("Records", (), (_model_identity(model, issue), judged_by)),
     ]
@@ -345,4 +348,4 @@ def _model_identity(model: SampledModel, issue: Issue) -> Table:
         ("working point, output", plain(model.working_point[-1], 6)),
         ("omsm_ros", issue.version or NOTHING),
     ]
-    return Table("Identity", (), known_rows(rows, 1))
+    return Table("Identity", (), known_rows(rows))

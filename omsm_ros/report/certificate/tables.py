@@ -3,7 +3,7 @@
 A row without a number is left out.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from datetime import datetime, timezone
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ from omsm_ros.readable import (
     superscript,
 )
 from omsm_ros.report.page_parts import fill
-from omsm_ros.report.tables import Table
+from omsm_ros.report.tables import Table, known_rows
 from omsm_ros.report.verdict import verdict_text
 from omsm_ros.units import MILLISECOND_S, NANOSECONDS_PER_S, PPM
 
@@ -83,7 +83,7 @@ def residual_table(certificate: Certificate) -> Table:
         ),
         ("edges", count(found.edges), ""),
     ]
-    return Table("Tests of the residual", ("", "meaning"), known_rows(rows, 1), prose="meaning")
+    return Table("Tests of the residual", ("", "meaning"), known_rows(rows), prose="meaning")
 
 
 def _in_words(p: float | None, good: str, bad: str) -> str:
@@ -140,7 +140,7 @@ def background_table(certificate: Certificate) -> Table:
         ("lag of the reference sensor", quantity(response.reference_lag_s, "s")),
         ("distance", NOTHING if polarity is None else _POLARITIES.get(polarity, NOTHING)),
     ]
-    return Table("Drift, backlash and direction", (), known_rows(rows, 1))
+    return Table("Drift, backlash and direction", (), known_rows(rows))
 
 
 def _or_none(value: float | None, unit: str) -> str:
@@ -233,7 +233,7 @@ def limit_table(certificate: Certificate) -> Table:
         highest = quantity(use.highest_hz, "Hz")
         rows.append(("intended scan", f"{quantity(use.speed_m_s, 'm/s')} rms, up to {highest}"))
         rows.append(("accuracy asked for, k = 2", quantity(use.accuracy_m, "m")))
-    return Table("Limits of the verdict", (), known_rows(rows, 1))
+    return Table("Limits of the verdict", (), known_rows(rows))
 
 
 def identity_table(calibration: Calibration, source: str, version: str) -> Table:
@@ -250,12 +250,7 @@ def identity_table(calibration: Calibration, source: str, version: str) -> Table
         ("made from", origin.made_from or NOTHING),
         ("omsm_ros", version or NOTHING),
     ]
-    return Table("Identity", (), known_rows(rows, 1))
-
-
-def known_rows(rows: Iterable[tuple[str, ...]], column: int) -> Sequence[tuple[str, ...]]:
-    """Return the rows that have something in ``column``."""
-    return [row for row in rows if row[column] != NOTHING]
+    return Table("Identity", (), known_rows(rows))
 
 
 def mode_table(calibration: Calibration) -> Table:
@@ -359,7 +354,7 @@ def undetected_table(certificate: Certificate) -> Table:
         ("assumed: no relaxation slower than", quantity(found.slowest_creep_s, "s")),
         ("assumed: no mode below", quantity(found.lowest_mode_hz, "Hz", 2)),
     )
-    rows += [(name, value, "", "") for name, value in known_rows(further, 1)]
+    rows += [(name, value, "", "") for name, value in known_rows(further)]
     columns = ("largest undetected size", "its rms on the intended scan", "part of the band")
     return Table("Undetected model errors", columns, rows)
 
