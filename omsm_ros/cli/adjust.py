@@ -34,10 +34,9 @@ def _declare(add: Arguments) -> None:
         default=[],
         metavar="SOURCE",
     )
-    add("--override", None, "ignore a settings mismatch (logged)")
+    add.shared("--override")
     add("--no-report", None, "no page")
-    add.origin()
-    add.polarity()
+    add.shared("--origin", "--polarity")
 
 
 def _adjust(args: argparse.Namespace) -> Facts:

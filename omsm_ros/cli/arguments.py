@@ -137,6 +137,25 @@ def trigger_of(args: argparse.Namespace) -> CommonTrigger:
     return CommonTrigger(counter_offset=args.counter_offset, stamp_tolerance=args.stamp_tolerance)
 
 
+_SHARED: dict[str, tuple[Any, dict[str, Any]]] = {
+    "--by-stamps": (None, {}),
+    "--channel": (str, {"metavar": "NAME|N"}),
+    "--counter-offset": (COUNTER_OFFSET, {"default": 0, "metavar": "SAMPLES"}),
+    "--namespace": (str, {"default": "", "metavar": "/CELL"}),
+    "--origin": (
+        _origin,
+        {"text": f"title block: {', '.join(_ORIGINS)}", "default": {}, "metavar": "JSON|FILE.yaml"},
+    ),
+    "--override": (None, {}),
+    "--polarity": (int, {"choices": (1, -1), "default": 1}),
+    "--stamp-tolerance": (STAMP_TOLERANCE, {"default": TWO_DRIVERS_S, "metavar": "S"}),
+    "--topics": (_topics, {"default": {}, "metavar": "axes=/x/axes,…"}),
+    "--unit": (units_of, {"metavar": "UNIT[,HEIGHT_UNIT]"}),
+}
+TRIGGER = ("--counter-offset", "--stamp-tolerance", "--by-stamps")
+"""What is stated of the trigger counters of axes and probe, or their lack."""
+
+
 class Arguments:
     """Declares the arguments of a command: each call adds one, each method some that are shared."""
 
@@ -179,43 +198,13 @@ class Arguments:
         """
         for name in names:
             self(name, Path, help, **more)
-        self("--namespace", str, "namespace of the cell in a bag of several", default="",
-             metavar="/CELL")  # fmt: skip
-        self("--topics", _topics, "names of the cell's topics in the bag, if they are not the "
-             "default ones", default={}, metavar="axes=/x/axes,…")  # fmt: skip
+        self.shared("--namespace", "--topics")
 
-    def trigger(self) -> None:
-        """Add what is stated of the trigger counters of axes and probe, or their lack."""
-        self("--counter-offset", COUNTER_OFFSET, "axes' trigger count minus the distance's trigger "
-             "count", default=0, metavar="SAMPLES")  # fmt: skip
-        self("--stamp-tolerance", STAMP_TOLERANCE, "largest difference between the stamps of axes "
-             "and probe for one trigger [s]", default=TWO_DRIVERS_S, metavar="S")  # fmt: skip
-        self("--by-stamps", None, "join probe and axes by their stamps: they share no trigger "
-             "counter")  # fmt: skip
-
-    def polarity(self) -> None:
-        """Add the sign of the distance."""
-        self("--polarity", int, "1: the distance decreases as Z increases; -1: it increases",
-             choices=(1, -1), default=1)  # fmt: skip
-
-    def override(self) -> None:
-        """Add ``--override``."""
-        self("--override", None, "ignore a settings mismatch of the calibration (logged)")
-
-    def origin(self) -> None:
-        """Add ``--origin``, the title block of report or certificate."""
-        self("--origin", _origin, f"title block: {', '.join(_ORIGINS)}", default={},
-             metavar="JSON|FILE.yaml")  # fmt: skip
-
-    def unit(self) -> None:
-        """Add the unit of files that do not state it."""
-        self("--unit", units_of, "unit of files that do not state it, such as mm, or mm,nm",
-             metavar="UNIT[,HEIGHT_UNIT]")  # fmt: skip
-
-    def channel(self) -> None:
-        """Add the channel of a file of several maps."""
-        self("--channel", str, "channel of a file of several maps, by name or number from 0",
-             metavar="NAME|N")  # fmt: skip
+    def shared(self, *names: str) -> None:
+        """Add options that several commands have."""
+        for name in names:
+            kind, more = _SHARED[name]
+            self(name, kind, **more)
 
     def catalogue(self) -> None:
         """Add ``--catalogue``, the database of calibrations and measurements."""

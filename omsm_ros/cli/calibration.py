@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from omsm_ros.cli.arguments import Arguments, cell_of, number, trigger_of
+from omsm_ros.cli.arguments import TRIGGER, Arguments, cell_of, number, trigger_of
 from omsm_ros.cli.command import CliCommand, Facts, kept, rejected, say, say_lines, table, written
 from omsm_ros.core.calibration.calibration_set import calibration_set
 from omsm_ros.core.calibration.repeatability import (
@@ -29,7 +29,7 @@ from omsm_ros.units import DEGREE_RAD, PPM
 def _declare_verify(add: Arguments) -> None:
     add.bags("bag", help="bag of a free path (chirp) on a fixed target")
     add("--calibration", "CAL.json", required=True)
-    add.trigger()
+    add.shared(*TRIGGER)
     add("--find-offset", None, "determine the counter offset from the motion, for --counter-offset")
 
 

@@ -6,6 +6,7 @@ from dataclasses import asdict
 
 from omsm_ros.cli.arguments import (
     TABLE_SUFFIX,
+    TRIGGER,
     Arguments,
     cell_of,
     json_object,
@@ -62,11 +63,9 @@ def _declare_correct(add: Arguments) -> None:
     add("--settings", json_object, "settings of this scan", metavar="JSON")
     add("--delay", STAMP_DELAY, default=0.0)
     add("--exposure", EXPOSURE, "exposure time of the probe [s]", default=0.0)
-    add.trigger()
+    add.shared(*TRIGGER)
     add("--no-report", None, "write cloud and summary only")
-    add.polarity()
-    add.override()
-    add.origin()
+    add.shared("--polarity", "--override", "--origin")
     declare_fit(add, None)
     declare_tolerance(add)
     add.catalogue()

@@ -45,7 +45,7 @@ def _declare_difference(add: Arguments) -> None:
     add("--register", parse_dofs, metavar="PARAMETERS")
     add("--uncertainty", UNCERTAINTY)
     add("--drift", UNCERTAINTY)
-    add.unit()
+    add.shared("--unit")
     add("--spacing", SPACING, "spacing of the compared grid [m]")
     add("--correlation-length", SPACING)
 

@@ -127,8 +127,7 @@ def _write_map(
 def _declare_export(add: Arguments) -> None:
     add("source", Path, "a result folder, a cloud or a map of any format")
     add("--out", "FILE", required=True)
-    add.unit()
-    add.channel()
+    add.shared("--unit", "--channel")
     add("--spacing", SPACING, "grid spacing for scattered points [m]")
 
 

@@ -186,12 +186,11 @@ def _declare_form(add: Arguments) -> None:
     add("--nominal", "SURFACE.yaml", required=True)
     add("--out", "DIR", required=True)
     add("--calibration", "CAL.json", "calibration to correct a scan with")
-    add.unit()
-    add.channel()
+    add.shared("--unit", "--channel")
     declare_fit(add, (AUTO,))
     declare_tolerance(add)
     add("--drawing", Drawing.parsed, metavar="INDICATION")
-    add.origin()
+    add.shared("--origin")
     add("--no-report", None, "write results without a report")
     for name, what in (("s", "shorter"), ("l", "longer")):
         add(
@@ -258,8 +257,7 @@ def _declare_compensate(add: Arguments) -> None:
     add("--nominal", "SURFACE.yaml", required=True)
     add("--low-pass", SPACING, required=True, metavar="WAVELENGTH")
     add("--out", "DIR", required=True)
-    add.unit()
-    add.channel()
+    add.shared("--unit", "--channel")
     add(
         "--spiral",
         SPACING,

@@ -12,6 +12,7 @@ from omsm_ros import __version__
 from omsm_ros.cli.arguments import (
     PART_ENTRIES,
     TABLE_SUFFIX,
+    TRIGGER,
     Arguments,
     cell_of,
     json_object,
@@ -77,10 +78,10 @@ def _declare(add: Arguments) -> None:
     add("--equivalent-time", None)
     add("--for", "SCAN", dest="scan")
     add("--accuracy", UNCERTAINTY)
-    add.origin()
+    add.shared("--origin")
     add("--multisine", "BAG")
     add("--plan", "PLAN.json", "plan of the multisine, as 'omsm plan multisine' writes it")
-    add.trigger()
+    add.shared(*TRIGGER)
     add("--report", "DIR", "write the certificate, or the model's page")
     add.catalogue()
 

@@ -47,7 +47,7 @@ def _declare_selfcal(add: Arguments) -> None:
     add("--out", "CAL.json", required=True)
     add("--harmonics", HARMONICS, default=DEFAULT_HARMONICS)
     add("--clocking", ANGLE_UNCERTAINTY, default=DEFAULT_CLOCKING_RAD)
-    add.polarity()
+    add.shared("--polarity")
     add("--static-gain", GAIN, "static gain of the probe, used without a step test", default=1.0)
     add("--gain-uncertainty", GAIN_UNCERTAINTY, default=UNINFORMATIVE_GAIN)
     add("--settings", json_object, default={}, metavar="JSON")

@@ -42,7 +42,7 @@ def _declare(add: Arguments) -> None:
     add("--nominal", "SURFACE.yaml", "surface of the turned part; default: a flat")
     add("--radius", RADIUS, "radius of the sphere [m], negative if convex")
     add("--geometry", "GEOMETRY.yaml", "from 'omsm align': the sources are what it leaves")
-    add.polarity()
+    add.shared("--polarity")
     add.epilog(_HOW)
 
 

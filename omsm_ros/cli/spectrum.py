@@ -25,9 +25,9 @@ def _declare_spectrum(add: Arguments) -> None:
     add("--exposure", EXPOSURE, "exposure of a reading [s]; estimated from scans at two speeds")
     add("--spot", SPOT, "diameter of the probe's spot [m], for the amplitude of marks", default=0.0)
     add("--settings", json_object, "settings of these scans", metavar="JSON")
-    add.polarity()
+    add.shared("--polarity")
     add("--no-report", None, "write results without a report")
-    add.override()
+    add.shared("--override")
 
 
 def _spectrum(args: argparse.Namespace) -> Facts:

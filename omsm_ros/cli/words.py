@@ -92,12 +92,21 @@ OPTIONS = catalogue("""
 --aperture: area of the part to evaluate [m]: R, annulus:R,INNER, ellipse:A,B or rectangle:A,B (half
     lengths along x and y), each with ,X,Y of its middle if that is not the origin, or
     polygon:X,Y,X,Y…; default: that of the nominal surface, else around all points
+--by-stamps: join probe and axes by their stamps: they share no trigger counter
+--channel: channel of a file of several maps, by name or number from 0
+--counter-offset: axes' trigger count minus the distance's trigger count
 --dust: leave out no points (none), those that no neighbouring track confirms (isolated), or
     clusters of N points and less; default: isolated ones, which count against the tolerance
 --fit: pose parameters to fit: 'auto', or of piston,tip,tilt,x,y,clocking,power; and unknown
     parameters of the shape: radius, radius_x, radius_y, conic, 'focal length', …
+--namespace: namespace of the cell in a bag of several
+--override: ignore a settings mismatch of the calibration (logged)
 --placement: standard uncertainty of x and y of the part [m], and of its clocking [rad]; what the
     surface hardly determines is fixed with this uncertainty; default: a part placed by hand
+--polarity: 1: the distance decreases as Z increases; -1: it increases
+--stamp-tolerance: largest difference between the stamps of axes and probe for one trigger [s]
+--topics: names of the cell's topics in the bag, if they are not the default ones
+--unit: unit of files that do not state it, such as mm, or mm,nm
 adjust --clamping: number of the clamping of each scan, where the part was taken off
 adjust --clocking: angle by which the part is turned on the chuck in each scan [rad]
 batch --scheduler: address of a Dask scheduler: tcp:// on this host, or tls://
