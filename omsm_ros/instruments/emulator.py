@@ -1,4 +1,4 @@
-"""The base of all emulated instruments: a clock, a line, and faults on command.
+"""The base of all emulated instruments: a clock, a line, and spoilt bytes.
 
 A model implements its answers and the encoding of samples. The instrument measures whether a
 client is connected or not: samples that are not sent are lost, and its counter advances.
@@ -6,18 +6,16 @@ client is connected or not: samples that are not sent are lost, and its counter 
 Not imitated: latency of the link, baud rate and UART overrun, jitter of the trigger.
 """
 
-import math
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.streams.blocks import FloatArray, Status
-from omsm_ros.errors import DeviceError
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.instruments.scaling import AXES, AxisScaling, ProbeReading
 from omsm_ros.twin.cell import Recording
 from omsm_ros.units import NANOSECONDS_PER_S
@@ -62,26 +60,6 @@ class RecordingSource:
         )
 
 
-class NumberedSource:
-    """Supplies samples without end; sample k is at x = k nm, so it can be identified.
-
-    All channels follow from k: see ``NumberedSource.take``.
-    """
-
-    length, period = math.inf, 1e-3
-
-    def take(self, first: int, count: int) -> Measured:
-        """Return distance (10 + k mod 80) µm, y -k nm, z k mod 1000 µm, b k µrad, c k mrad."""
-        k = np.arange(first, first + count, dtype=np.float64)
-        return Measured(
-            (10 + k % 80) * 1e-6,
-            np.full(count, 0.5, np.float32),
-            np.full(count, Status.OK, np.uint8),
-            {"x": k * 1e-9, "y": -k * 1e-9, "z": k % 1000 * 1e-6, "b": k * 1e-6, "c": k * 1e-3},
-        )
-
-
-Source: TypeAlias = RecordingSource | NumberedSource
 # The encoders of an emulated cell. One turn is 2^28 counts: 32 bits hold 16 whole turns, so
 # nothing is lost when they wrap.
 _LINEAR = AxisScaling(counts_per_unit=1e10, wrap=2**32)
@@ -109,26 +87,16 @@ class InstrumentLink(Protocol):
     def write(self, data: bytes, stop: threading.Event | None = None) -> int:
         """Send ``data``; return how many bytes of it were taken."""
 
-    def plug(self) -> None:
-        """Offer the line."""
-
-    def unplug(self) -> None: ...
-
 
 @dataclass(slots=True)
 class InstrumentFaults:
-    """Faults to come: counts are used up, the other values last until they are set back.
+    """Faults of the line and the clock.
 
-    lose, duplicate: samples not sent, sent twice
-    slow_answers: delay of answers [s]
     rate: actual rate over the rate set [1]
     noise_rate, flip_rate, drop_rate: probability, for each sample, of random bytes before it, of
         one inverted bit in it, of its loss [1]
     """
 
-    lose: int = 0
-    duplicate: int = 0
-    slow_answers: float = 0.0
     rate: float = 1.0
     noise_rate: float = 0.0
     flip_rate: float = 0.0
@@ -143,7 +111,7 @@ class Instrument:
     def __init__(
         self,
         line: InstrumentLink,
-        source: Source | None = None,
+        source: RecordingSource | None = None,
         *,
         triggered: bool = False,
         probe: ProbeReading | None = None,
@@ -157,7 +125,7 @@ class Instrument:
         """
         self.faults = InstrumentFaults()
         self._line = line
-        self._source: Source | None = source if source or triggered else NumberedSource()
+        self._source = source
         self._triggered = triggered
         self._probe, self._axes = probe or ProbeReading(), axes
         self._clock = clock
@@ -167,10 +135,8 @@ class Instrument:
         self._counter = 0
         self._origin = self._started = clock()
         self._due = 0.0  # samples measured since ``_origin``
-        self._quiet_until = self._off_until = 0.0
-        self._unplugged = False
-        self._later: list[tuple[float, bytes]] = []
         self._session = 0
+        self._stop: threading.Event | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -195,32 +161,15 @@ class Instrument:
         raise NotImplementedError
 
     def step(self, stop: threading.Event | None = None) -> None:
-        """Do what is due now: reconnect, answer, measure, send."""
-        now = self._clock()
-        if self._unplugged and now >= self._off_until:
-            self._line.plug()
-            self._unplugged = False
-        if now < max(self._off_until, self._quiet_until):
-            self._measure(now)
-            return
-        try:
-            self._exchange(now, stop)
-        except (DeviceError, OSError):
-            # Another thread may unplug the line while it is in use.
-            if self._clock() >= self._off_until:
-                raise
-
-    def _exchange(self, now: float, stop: threading.Event | None) -> None:
+        """Do what is due now: answer, measure, send."""
+        self._stop = stop
         data = self._line.read()
         if self._line.sessions != self._session:
             self._session = self._line.sessions
-            self._later.clear()
             self.greet()
         if data:
             self.receive(data)
-        while self._later and self._later[0][0] <= now:
-            self._line.write(self._later.pop(0)[1], stop)
-        if wire := b"".join(self._measure(now)):
+        if wire := b"".join(self._measure(self._clock())):
             self._line.write(wire, stop)
 
     def serve(self, stop: threading.Event) -> None:
@@ -228,7 +177,7 @@ class Instrument:
         while not stop.wait(WRITE_INTERVAL_S):
             self.step(stop)
 
-    def play(self, source: Source, time_lapse: float = 1.0) -> None:
+    def play(self, source: RecordingSource, time_lapse: float = 1.0) -> None:
         """Begin a motion; its trigger counts from zero."""
         self._source, self._lapse = source, time_lapse
         self._taken = self._counter = 0
@@ -248,55 +197,25 @@ class Instrument:
         """End the motion."""
         self._source = None
 
-    def unplug(self, seconds: float) -> None:
-        """Disconnect the line for ``seconds``; the device continues to measure."""
-        self._off_until = self._clock() + seconds
-        self._line.unplug()
-        self._unplugged = True
-
-    def power_cycle(self, seconds: float) -> None:
-        """Switch off for ``seconds``, then on with factory settings and a counter at zero."""
-        self.unplug(seconds)
-        self.restart()
-        self._started = self._off_until
-
-    def restart(self) -> None:
-        """Set settings and counter as after switching on; the line stays connected."""
-        self._counter = 0
-        self._later.clear()
-        self._started = self._clock()
-        self.reset()
-
-    def stall(self, seconds: float) -> None:
-        """Stop sending and answering for ``seconds``; samples of that time are lost."""
-        self._quiet_until = self._clock() + seconds
-
-    def reset_counter(self) -> None:
-        """Count from zero again, as upon a trigger command."""
-        self._counter = 0
-
     def _measure(self, now: float) -> list[bytes]:
         """Return the bytes of the samples that are due; empty while none are to be sent."""
         elapsed = (now - self._origin) * self._lapse
         self._origin = now
-        if self._source is None or now < self._started:
+        if self._source is None:
             return []
         self._due += elapsed * self.rate() * self.faults.rate
-        most = _MAX_SAMPLES if self._sending() else self._due
+        most = _MAX_SAMPLES if self.streaming() else self._due
         count = int(min(self._due, most, self._source.length - self._taken))
         self._due -= count
         if count <= 0:
             return []
         counters = (self._counter + np.arange(count)) % self.counter_range
         measured = self._source.take(self._taken, count)
-        packed = self.pack(measured, counters, self._times(count, now)) if self._sending() else []
+        packed = self.pack(measured, counters, self._times(count, now)) if self.streaming() else []
         pieces = self._spoil(packed)
         self._taken += count
         self._counter = (self._counter + count) % self.counter_range
         return pieces
-
-    def _sending(self) -> bool:
-        return self.streaming() and self._clock() >= max(self._quiet_until, self._off_until)
 
     def _times(self, count: int, now: float) -> np.ndarray:
         """Return the device time of the last ``count`` samples [ns]."""
@@ -316,7 +235,7 @@ class Instrument:
             for rate in (self.faults.drop_rate, self.faults.noise_rate, self.faults.flip_rate)
         )
         for i, piece in enumerate(packed):
-            if piece and (dropped[i] or _use(self.faults, "lose", 1)):
+            if piece and dropped[i]:
                 continue
             if piece and flipped[i]:
                 damaged = bytearray(piece)
@@ -324,7 +243,7 @@ class Instrument:
                 piece = bytes(damaged)
             if piece and noisy[i]:
                 piece = self._random.bytes(_NOISE_BYTES) + piece
-            pieces += [piece] * (1 + _use(self.faults, "duplicate", 1))
+            pieces.append(piece)
         return pieces
 
     def _struck(self, rate: float, count: int) -> NDArray[np.bool_]:
@@ -332,11 +251,5 @@ class Instrument:
         return self._random.random(count) < rate if rate else np.zeros(count, np.bool_)
 
     def say(self, wire: bytes) -> None:
-        """Queue an answer, delayed by the faults."""
-        self._later.append((self._clock() + self.faults.slow_answers, wire))
-
-
-def _use(faults: InstrumentFaults, name: str, most: int) -> int:
-    used: int = min(getattr(faults, name), most)
-    setattr(faults, name, getattr(faults, name) - used)
-    return used
+        """Send an answer."""
+        self._line.write(wire, self._stop)

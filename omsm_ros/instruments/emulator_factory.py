@@ -365,7 +365,7 @@ def player_for(
     if known.second is not None and second is not None:
         devices.append((known.second.make(second, triggered=True), known.second.part))
     for one, _ in devices:
-        one.faults = replace(faults)  # their counts are used up
+        one.faults = faults
     return Player(*devices)
 
 

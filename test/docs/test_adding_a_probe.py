@@ -17,7 +17,7 @@ def test_the_page_runs_from_top_to_bottom():
     exec("\n".join(blocks), names)
     assert len(names["blocks"]) > 30
     line = names["Loopback"]()
-    line.instrument = names["PolledEmulator"](line.line, clock=line.clock)
+    line.instrument = names["faulty"](names["PolledEmulator"])(line.line, clock=line.clock)
     settings = names["BlockSettings"](sample_period=0.02, block_size=10)
     polled = names["PolledLamp"](line, settings, line.clock.nanoseconds, line.clock)
     polled.open()

@@ -22,6 +22,7 @@ from omsm_ros.instruments.parameters import REFERENCE_PARAMETERS, defaults
 from omsm_ros.instruments.reader import DeviceReader, State
 from omsm_ros.instruments.stream import StreamDevice
 
+from .faulty import faulty
 from .with_commands import CapaNcdtEmulator
 
 SOON = 20.0
@@ -82,7 +83,7 @@ def checked(got: list[BlockPair]) -> None:
 def test_the_driver_is_back_by_itself(where: str, fault: str, tmp_path: Path) -> None:
     link = str(tmp_path / "probe") if where == "pty" else "tcp://127.0.0.1:0"
     with line_for(link) as line:
-        emulator = ChrocodileEmulator(line)
+        emulator = faulty(ChrocodileEmulator)(line)
         device = probe(line.path)
         with serving(emulator), reading(device) as (reader, got):
             wait("samples", lambda: device.statistics.delivered > 300)
@@ -100,7 +101,7 @@ def test_the_driver_is_back_by_itself(where: str, fault: str, tmp_path: Path) ->
 
 def test_a_second_client_waits_for_the_first_to_leave() -> None:
     with TcpServer() as line:
-        emulator = ChrocodileEmulator(line)
+        emulator = faulty(ChrocodileEmulator)(line)
         with serving(emulator):
             first, second = probe(line.path), probe(line.path)
             with reading(first):
@@ -116,7 +117,7 @@ def test_a_second_client_waits_for_the_first_to_leave() -> None:
 
 def test_a_reference_is_read_in_addition_to_its_command_port() -> None:
     with TcpServer() as data, TcpServer() as commands:
-        emulator = CapaNcdtEmulator(data, commands=commands)
+        emulator = faulty(CapaNcdtEmulator)(data, commands=commands)
         port = int(commands.path.rpartition(":")[2])
         values: dict[str, Any] = defaults(REFERENCE_PARAMETERS)
         values |= {"port": data.path, "command_port": port, "sample_period": 2e-3}
@@ -132,7 +133,7 @@ def test_a_reference_is_read_in_addition_to_its_command_port() -> None:
 def test_a_cable_that_is_pulled_while_something_is_sent_ends_nothing(tmp_path: Path) -> None:
     """Another thread than the serving one unplugs it, at any time."""
     with line_for(str(tmp_path / "probe")) as line:
-        emulator = ChrocodileEmulator(line)
+        emulator = faulty(ChrocodileEmulator)(line)
         sent = line.write
 
         def pulled(data: bytes, stop: threading.Event | None = None) -> int:

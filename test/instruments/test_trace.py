@@ -20,6 +20,8 @@ from omsm_ros.instruments.emulator import AXIS_SCALING
 from omsm_ros.instruments.factory import TracedTransport
 from omsm_ros.instruments.transport import TcpTransport
 
+from .faulty import faulty
+
 SIX = ChrocodileSettings(axes=AXIS_SCALING)
 
 
@@ -29,7 +31,7 @@ SIX = ChrocodileSettings(axes=AXIS_SCALING)
 )
 def test_a_replayed_trace_gives_the_same_blocks(device: Any, emulator: Any, tmp_path: Path) -> None:
     loop = Loopback()
-    loop.instrument = emulator(loop.line, clock=loop.clock)
+    loop.instrument = faulty(emulator)(loop.line, clock=loop.clock)
     path = tmp_path / "wire.trace"
     driver = device(
         TracedTransport(loop, path, loop.clock), SIX, loop.clock.nanoseconds, loop.clock

@@ -11,6 +11,8 @@ from omsm_ros.instruments.emulator import Instrument, InstrumentLink
 from omsm_ros.instruments.micro_epsilon import emulator as micro_epsilon
 from omsm_ros.units import MICROSECOND_S
 
+from .faulty import faulty
+
 RATES_KHZ = (0.1, 0.2, 0.3, 1, 2.5, 5, 10, 25, 50, 70)
 SAMPLE_STEP_US = 4
 SERIAL = 11_020_009
@@ -34,9 +36,9 @@ class Controller(Instrument):
         """Return the answer to a command, prompt included."""
         raise NotImplementedError
 
-    def _exchange(self, now: float, stop: threading.Event | None) -> None:
+    def step(self, stop: threading.Event | None = None) -> None:
         self.work()
-        super()._exchange(now, stop)
+        super().step(stop)
 
     def work(self) -> None:
         """Answer the commands that arrived."""
@@ -88,6 +90,6 @@ class WithCommands:
         self.data = Loopback()
         self.port = Loopback(self.data.clock)
         clock = self.data.clock
-        self.emulator = emulator(self.data.line, clock=clock, commands=self.port.line)
+        self.emulator = faulty(emulator)(self.data.line, clock=clock, commands=self.port.line)
         self.data.instrument = self.port.instrument = self.emulator
         self.device = device(self.data, wanted, clock.nanoseconds, clock, commands=self.port)

@@ -145,7 +145,7 @@ class ChrocodileEmulator(Instrument):
             self._binary = name == "BIN"
             return ""
         if name in ("TRE", "TRG"):
-            self.reset_counter()
+            self._counter = 0
             return ""
         if name in ("CTN", "TRW", "STR", "DRK", "NOP"):
             return ""
