@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,44 +29,28 @@ _RENEW_S, _RENEW_PERIODS, _RENEW_PART = 1.0, 5, 0.1
 # Time between two checks of the time-out of an answer [s].
 _ANSWER_S = 0.05
 
+_COUNTS = (
+    "decoded", "delivered", "pending", "held", "spoilt", "duplicates", "withheld", "missed",
+    "least_missed", "lost", "gaps", "restarts", "resets", "blocks", "period_deviation",
+    "period_warnings", "renewals",
+)  # fmt: skip
+"""All counts since construction, exact between two calls of ``poll``.
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StreamStatistics:
-    """All counts since construction, exact between two calls of ``poll``.
-
-    decoded: samples that came whole
-    delivered, pending: in blocks handed over, and waiting for their block to fill
-    held: waiting for their successor;  spoilt: with a counter that jumped ahead and back
-    duplicates: received twice
-    withheld: kept back because the device runs at another rate than it was set to, its encoders
-        lost their positions, or no arrival confirms that it missed no trigger before them
-    missed: triggers without a sample of this device, by the arrivals (``MissedTriggerDetector``)
-    least_missed: the least number of them that the arrivals show; 0 = none do
-    lost, gaps: trigger counts that never arrived, and in how many places
-    restarts: how often the device's counter or clock fell back
-    resets: how many of these came after a silence, with the connection kept: the counter was reset
-    period_deviation: of the last full block's device time from nominal, relative [1]
-    period_warnings: full blocks beyond PERIOD_TOLERANCE
-    renewals: connections made again because nothing came
-    """
-
-    decoded: int = 0
-    delivered: int = 0
-    pending: int = 0
-    held: int = 0
-    spoilt: int = 0
-    duplicates: int = 0
-    withheld: int = 0
-    missed: int = 0
-    least_missed: int = 0
-    lost: int = 0
-    gaps: int = 0
-    restarts: int = 0
-    resets: int = 0
-    blocks: int = 0
-    period_deviation: float = 0.0
-    period_warnings: int = 0
-    renewals: int = 0
+decoded: samples that came whole
+delivered, pending: in blocks handed over, and waiting for their block to fill
+held: waiting for their successor;  spoilt: with a counter that jumped ahead and back
+duplicates: received twice
+withheld: kept back because the device runs at another rate than it was set to, its encoders
+    lost their positions, or no arrival confirms that it missed no trigger before them
+missed: triggers without a sample of this device, by the arrivals (``MissedTriggerDetector``)
+least_missed: the least number of them that the arrivals show; 0 = none do
+lost, gaps: trigger counts that never arrived, and in how many places
+restarts: how often the device's counter or clock fell back
+resets: how many of these came after a silence, with the connection kept: the counter was reset
+period_deviation: of the last full block's device time from nominal, relative [1]
+period_warnings: full blocks beyond PERIOD_TOLERANCE
+renewals: connections made again because nothing came
+"""
 
 
 class StreamDevice:
@@ -280,20 +264,17 @@ class StreamDevice:
         return f"{rate}, sample_period states {1 / period:.6g} Hz"
 
     @property
-    def statistics(self) -> StreamStatistics:
+    def statistics(self) -> SimpleNamespace:
         """Return the counts of all samples."""
         owners = (self, self._tracker, self._cutter, self._cutter.detector)
-        found = {
-            each.name: next((getattr(o, each.name) for o in owners if hasattr(o, each.name)), 0)
-            for each in fields(StreamStatistics)
-        }
-        return StreamStatistics(**found)
+        found = {n: next((getattr(o, n) for o in owners if hasattr(o, n)), 0) for n in _COUNTS}
+        return SimpleNamespace(**found)
 
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included; from any thread."""
         found = {} if self._decoder is None else vars(self._decoder.statistics)
         with self._counting_lock:
-            return asdict(self.statistics) | found
+            return vars(self.statistics) | found
 
     def _prepare(self) -> None:
         """Set the device up; raises DeviceError."""

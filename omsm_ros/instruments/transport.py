@@ -8,10 +8,12 @@ from __future__ import annotations
 import math
 import re
 import socket
+import sys
 import termios
 import time
 from collections.abc import Callable
-from typing import Protocol
+from importlib import import_module
+from typing import Any, Protocol
 from urllib.parse import SplitResult, urlsplit
 
 import serial
@@ -331,6 +333,17 @@ def transport_for(address: str, baud_rate: int = DEFAULT_BAUD_RATE) -> Transport
             )
         return SerialTransport(path, int(value) if value else baud_rate)
     return SerialTransport(address, baud_rate)
+
+
+def optional_package(what: str, *modules: str) -> Any:
+    """Return the package of ``modules``, which ``what`` needs; DeviceError if it is missing."""
+    name = modules[0].partition(".")[0]
+    try:
+        for module in modules:
+            import_module(module)
+    except ImportError as err:
+        raise DeviceError(f"{what} needs {name}: pip install {name}") from err
+    return sys.modules[name]
 
 
 def serial_ports() -> list[str]:

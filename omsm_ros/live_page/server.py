@@ -163,22 +163,22 @@ class LiveServer:
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         if (place := _split(request.path)) is None:
-            return _text(http.HTTPStatus.BAD_REQUEST, "the address cannot be read\n")
+            return _response(http.HTTPStatus.BAD_REQUEST, "the address cannot be read\n")
         # Before websockets 17 a request has no method but GET.
         if getattr(request, "method", "GET") != "GET":
-            refusal = _text(http.HTTPStatus.METHOD_NOT_ALLOWED, "the page is only read: GET\n")
+            refusal = _response(http.HTTPStatus.METHOD_NOT_ALLOWED, "the page is only read: GET\n")
             refusal.headers["Allow"] = "GET"
             return refusal
         given = parse_qs(place.query).get("token", [""])[0]
         if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
-            return _text(http.HTTPStatus.FORBIDDEN, "the address lacks its token\n")
+            return _response(http.HTTPStatus.FORBIDDEN, "the address lacks its token\n")
         if not self._from_here(request):
-            return _text(http.HTTPStatus.FORBIDDEN, "requested by another page\n")
+            return _response(http.HTTPStatus.FORBIDDEN, "requested by another page\n")
         if place.path == "/live":
             return None
         if place.path == "/":
-            return _html(self._page)
-        return _text(http.HTTPStatus.NOT_FOUND, "there is only /\n")
+            return _response(http.HTTPStatus.OK, self._page, _PAGE)
+        return _response(http.HTTPStatus.NOT_FOUND, "there is only /\n")
 
     def _from_here(self, request: Request) -> bool:
         """Return whether the request is not of a page of another origin, nor to a foreign name.
@@ -232,28 +232,20 @@ def _split(address: str) -> SplitResult | None:
         return None
 
 
-def _html(text: str) -> Response:
-    headers = Headers(
-        {
-            "Content-Type": "text/html; charset=utf-8",
-            "Cache-Control": "no-store",
-            "X-Content-Type-Options": "nosniff",
-            "X-Frame-Options": "DENY",
-            "Referrer-Policy": "no-referrer",
-        }
-    )
-    return _response(http.HTTPStatus.OK, headers, text)
+_PLAIN = {"Content-Type": "text/plain; charset=utf-8"}
+_PAGE = {
+    "Content-Type": "text/html; charset=utf-8",
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+}
 
 
-def _text(status: http.HTTPStatus, text: str) -> Response:
-    return _response(status, Headers({"Content-Type": "text/plain; charset=utf-8"}), text)
-
-
-def _response(status: http.HTTPStatus, headers: Headers, text: str) -> Response:
+def _response(status: http.HTTPStatus, text: str, headers: dict[str, str] = _PLAIN) -> Response:
     body = text.encode()
-    headers["Content-Length"] = str(len(body))
-    headers["Connection"] = "close"
-    return Response(status.value, status.phrase, headers, body)
+    whole = headers | {"Content-Length": str(len(body)), "Connection": "close"}
+    return Response(status.value, status.phrase, Headers(whole), body)
 
 
 def _serve(server: Server) -> None:

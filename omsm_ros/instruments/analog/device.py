@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import Any, TypeAlias
 from urllib.parse import parse_qs
@@ -14,7 +15,7 @@ from omsm_ros.instruments.arrivals import DeviceClock
 from omsm_ros.instruments.blocks import BlockPair, BlockSettings
 from omsm_ros.instruments.parameters import NowNs, Values, block_settings, probe_reading_of
 from omsm_ros.instruments.scaling import ProbeReading
-from omsm_ros.instruments.transport import parts_of
+from omsm_ros.instruments.transport import optional_package, parts_of
 from omsm_ros.units import NANOSECONDS_PER_S
 
 # The buffer of the converter's driver is longer than any pause of a healthy host [s].
@@ -183,14 +184,7 @@ def analog_input(address: str, channels: int) -> Converter:
     raise ConfigurationError(f"address {address!r}, expected daq://Dev1/ai0 or synthetic://")
 
 
-def _nidaqmx() -> Any:
-    try:
-        import nidaqmx
-        import nidaqmx.constants
-    except ImportError as err:
-        raise DeviceError("daq:// needs nidaqmx: pip install nidaqmx") from err
-    return nidaqmx
-
+_nidaqmx = partial(optional_package, "daq://", "nidaqmx.constants")
 
 STANDARD_GRAVITY = 9.80665
 """[m/s²], exact by definition."""

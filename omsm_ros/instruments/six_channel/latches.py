@@ -8,6 +8,7 @@ import re
 import socket
 import time
 from contextlib import suppress
+from functools import partial
 from typing import Any
 from urllib.parse import parse_qs
 
@@ -18,7 +19,7 @@ from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.errors import ConfigurationError, DeviceError, DeviceTimeoutError
 from omsm_ros.instruments.scaling import AXES, whole_counts
 from omsm_ros.instruments.six_channel.protocol import BODY_SIZE, FRAME, ProbeScaling, encode_frames
-from omsm_ros.instruments.transport import TcpTransport, parts_of
+from omsm_ros.instruments.transport import TcpTransport, optional_package, parts_of
 from omsm_ros.units import NANOSECONDS_PER_S
 
 # Variables read one by one over Beckhoff ADS are neither synchronous with the trigger nor fast
@@ -149,12 +150,7 @@ class AdsRing:
         return int.from_bytes(raw[:_WRITTEN_SIZE], "little"), ring
 
 
-def _pyads() -> Any:
-    try:
-        import pyads
-    except ImportError as err:
-        raise DeviceError("ADS needs pyads: pip install pyads") from err
-    return pyads
+_pyads = partial(optional_package, "ADS", "pyads")
 
 
 # Written by the documentation of PandABlocks-server, tested against an emulator, not on hardware.
@@ -392,10 +388,6 @@ class PandaBox:
         return whole.astype(np.int64)
 
 
-def _pandablocks() -> Any:
-    try:
-        import pandablocks.commands
-        import pandablocks.connections
-    except ImportError as err:
-        raise DeviceError("a PandABox needs pandablocks: pip install pandablocks") from err
-    return pandablocks
+_pandablocks = partial(
+    optional_package, "a PandABox", "pandablocks.commands", "pandablocks.connections"
+)
