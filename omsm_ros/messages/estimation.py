@@ -95,6 +95,8 @@ estimation.unknown_response: the response is known nowhere to {gain:%/1} of gain
 estimation.worse_than_impulse_response: a free run over the held-out last part accounts for
     {model:%/4} at the frequencies of the inputs, an impulse response without a model for
     {comparator:%/4}: ask for another order
+estimation.missed_response: the part of the residual that follows the input is {share:%} of the
+    output of the model, more than {limit:%}: more poles, a longer delay, or a longer record
 estimation.residual_follows_input: the residual follows the input ({p:chance}): more poles, a longer
     delay, or something that is not linear
 estimation.order_differs: order {order} was asked for, {free} would have been chosen: its

@@ -95,7 +95,8 @@ def identify_samples(
     frequency = np.geomspace(1, longest / 2 - 1, _FREQUENCIES) / (longest * period)
     sections, factor = _inflated(sections, choice, frequency)
     blocks = _blocks(choice.chosen, period)
-    corrected = sections.response(frequency) + _missed(choice.chosen, frequency * period)
+    missed, follows = _missed(choice.chosen, frequency * period)
+    corrected = sections.response(frequency) + missed
     others = [other.response(frequency * period) for other in choice.alternatives]
     others_of = np.array([corrected, *others], np.complex128).transpose(1, 0, 2)
     valid = [valid_range(sections, blocks, frequency, i, each) for i, each in enumerate(others_of)]
@@ -105,7 +106,7 @@ def identify_samples(
         sections=sections,
         valid=valid,
         working_point=(*np.mean(first.inputs, axis=0).tolist(), steady),
-        certificate=_certificate(choice, sections, valid, factor),
+        certificate=_certificate(choice, sections, valid, factor, follows),
     )
 
 
@@ -118,21 +119,23 @@ def _independence(chosen: SampledCandidate) -> float:
     return independence(chosen.fit.residual, np.concatenate(drives))
 
 
-def _missed(chosen: SampledCandidate, cycles: FloatArray) -> ComplexArray:
+def _missed(chosen: SampledCandidate, cycles: FloatArray) -> tuple[ComplexArray, float]:
     """Return what the model misses at ``cycles`` (f,) a sample, (m, f): the residual without model.
 
     An impulse response from the inputs to the residual of the first record resolves modes that are
-    narrower than a block of lines.
+    narrower than a block of lines. The second value is the rms of its output over the model's.
     """
     fitted, one = chosen.fit, chosen.fit.problem.spectra[0]
-    grid = np.zeros(len(one.record))
-    grid[one.places] = fitted.residual[: len(one.places)]
+    residual, grid = fitted.residual[: len(one.places)], np.zeros(len(one.record))
+    grid[one.places] = residual
     inputs = one.record.inputs - np.mean(one.record.inputs, axis=0)
     taps = impulse_response(inputs, grid, one.record.used)
     if taps is None:
-        return np.zeros((inputs.shape[1], len(cycles)), np.complex128)
+        return np.zeros((inputs.shape[1], len(cycles)), np.complex128), 0.0
+    answer = np.sum(signal.fftconvolve(inputs.T, taps, axes=1), axis=0)[one.places]
+    modelled = max(float(np.std(one.output - residual)), np.finfo(float).tiny)
     turned = np.exp(-2j * np.pi * np.outer(np.arange(taps.shape[1]), cycles))
-    return np.asarray(taps @ turned, np.complex128)
+    return np.asarray(taps @ turned, np.complex128), float(np.std(answer)) / modelled
 
 
 def _checked(record: SampledRecord) -> SampledRecord:
@@ -331,11 +334,13 @@ def _certificate(
     sections: ParallelSections,
     valid: Sequence[tuple[float, float]],
     widened: float,
+    follows: float,
 ) -> dict[str, object]:
     """Return JSON values, ending with ``reasons``, ``warnings`` and ``verdict``.
 
     valid: range [Hz] within the limits, for each input
     widened: factor on the uncertainties, for the choice of the order
+    follows: part of the residual that an impulse response makes of the inputs, over the model
     "predicted" is the share of the variance of held-out parts that free runs explain.
     """
     chosen, limits = choice.chosen, SAMPLED_LIMITS
@@ -348,7 +353,10 @@ def _certificate(
     accepted = Notice("estimation.accepted", low=low, high=high)
     if not high > low:
         accepted = Notice("estimation.accepted_apart")
-    if independent < _LEAST_INDEPENDENCE_P:
+    if independent < _LEAST_INDEPENDENCE_P and follows > _LIMIT:
+        # Blocks take it for noise, and a sweep or lost readings spread it over all lines.
+        reasons.append(Notice("estimation.missed_response", share=follows, limit=_LIMIT))
+    elif independent < _LEAST_INDEPENDENCE_P:
         warnings.append(Notice("estimation.residual_follows_input", p=independent))
     if order != free_order:
         warnings.append(

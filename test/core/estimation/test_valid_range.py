@@ -112,3 +112,22 @@ def test_samples_that_are_lost_together_support_no_range(seed):
     model = identify_samples([SampledRecord(sweep[:, np.newaxis], output, used)], 1.0)
     assert model.certificate["verdict"].startswith("accepted")
     assert model.valid[0][1] < 0.15
+
+
+@pytest.mark.parametrize(("order", "accepted"), [(2, False), (4, True)])
+def test_a_model_of_too_few_poles_whose_residual_follows_the_input_is_rejected(order, accepted):
+    """One of two modes is missing: a sweep shows it for a while, so most of the record is right."""
+    rng, used = np.random.default_rng(1), np.ones(4000, bool)
+    used[100:230] = False
+    sweep = signal.chirp(np.arange(4000), 0.001, 4000, 0.48)
+    output = np.zeros(4000)
+    for cycles, damping, gain in ((0.03, 0.02, 1.5), (0.15, 0.03, 1.0)):
+        pole = np.exp(2 * np.pi * cycles * (1j * np.sqrt(1 - damping**2) - damping))
+        down = np.poly([pole, np.conj(pole)]).real
+        output += gain * signal.lfilter([0.0, np.sum(down)], down, sweep)
+    output += 0.1 * np.std(output) * rng.normal(size=4000)
+    record = SampledRecord(sweep[:, np.newaxis], np.where(used, output, 0.0), used)
+    certificate = identify_samples([record], 1.0, order=order).certificate
+    assert certificate["predicted"] > 0.75
+    assert certificate["verdict"].startswith("accepted") == accepted
+    assert any("residual that follows" in why for why in certificate["reasons"]) != accepted
