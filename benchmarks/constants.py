@@ -34,12 +34,12 @@ _ESTIMATION = "omsm_ros.core.estimation"
 _ROOT = "omsm_ros.core.model_errors"
 _IDENTIFICATION = "omsm_ros.core.identification"
 _PLACES = {
-    "_CLEARLY": f"{_ESTIMATION}.noise",
+    "CLEARLY": f"{_ESTIMATION}.noise",
     "_INTERVAL": f"{_ESTIMATION}.noise",
     "_DAMPED_BEYOND": f"{_ESTIMATION}.model_order",
     "_LINEAR_ITERATIONS": f"{_ESTIMATION}.model_order",
     "_ADDED_POLE": f"{_ESTIMATION}.model_order",
-    "_BRIDGE_S": f"{_ESTIMATION}.output_error",
+    "_BRIDGE_S": f"{_ESTIMATION}.parallel_sections",
     "_SMOOTHING_BINS": f"{_ESTIMATION}.output_error",
     "FASTEST_CREEP_S": f"{_ROOT}.families",
     "_CREEPS_A_DECADE": f"{_ROOT}.families",
@@ -56,14 +56,11 @@ _PLACES = {
     "_LEAST_LINES": f"{_ROOT}.residual_diagnostics",
     "_HALF_WIDTH": f"{_ROOT}.residual_diagnostics",
     "FALSE_ALARM": f"{_ROOT}.residual_diagnostics",
-    "_LAGS": f"{_ROOT}.residual_diagnostics",
+    "LAGS": f"{_ROOT}.residual_diagnostics",
     "_LEAST_LIKELY": f"{_ROOT}.undetected",
     "_LITTLE": f"{_ROOT}.undetected",
     "_MOST_ROUNDS": f"{_IDENTIFICATION}.model_error_search",
     "_PLAIN_POLES": f"{_IDENTIFICATION}.model_error_search",
-    "_UNDECIDED": f"{_IDENTIFICATION}.model_error_search",
-    "_LEAST_DECAYS": f"{_IDENTIFICATION}.model_error_search",
-    "_SETTLED_DECAYS": f"{_IDENTIFICATION}.model_error_search",
 }
 
 

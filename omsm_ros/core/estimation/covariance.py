@@ -8,7 +8,7 @@ from omsm_ros.core.estimation.noise import RandomWalk, scatter_in_time, uneven_r
 from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
-from omsm_ros.linear_algebra import BLOCK_VALUES, orthonormal
+from omsm_ros.linear_algebra import orthonormal
 
 # Two orders for each of six lines of hum.
 _MAX_NOISE_ORDER = 12
@@ -91,25 +91,10 @@ def weighted_gram(rows: FloatArray, length: int, noise: FloatArray) -> FloatArra
     weight[0] *= 0.5
     if length % 2 == 0:
         weight[-1] *= 0.5
-    weight = np.sqrt(weight)
-
-    def parts(block: slice) -> FloatArray:
-        found = np.empty((len(rows[block]), 2 * len(weight)))
-        for row, part in zip(rows[block], found, strict=True):
-            part[:] = (weight * fft.rfft(row, length)).view(np.float64)
-        return found
-
-    # A long record is transformed in blocks: all rows at once would double the memory.
-    step = max(BLOCK_VALUES // length, 1)
-    blocks = [slice(first, first + step) for first in range(0, len(rows), step)]
-    gram = np.empty((len(rows), len(rows)))
-    for i, block in enumerate(blocks):
-        mine = parts(block)
-        gram[block, block] = mine @ mine.T
-        for other in blocks[:i]:
-            gram[block, other] = mine @ parts(other).T
-            gram[other, block] = gram[block, other].T
-    return gram
+    parts = np.empty((len(rows), 2 * len(weight)))
+    for row, part in zip(rows, parts, strict=True):
+        part[:] = (np.sqrt(weight) * fft.rfft(row, length)).view(np.float64)
+    return np.asarray(parts @ parts.T)
 
 
 def parameter_covariance(

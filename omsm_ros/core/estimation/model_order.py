@@ -176,14 +176,12 @@ def fit(
     problem: Problem,
     structure: Structure,
     starts: Sequence[FloatArray],
-    evaluations: int = _FINISH_EVALUATIONS,
     *,
     budget: EvaluationBudget | None = None,
     part: CompressedProblem | None = None,
 ) -> Fit:
     """Improve each of ``starts``, ψ, by a few evaluations; return the minimum of the best of them.
 
-    evaluations: most iterations to that minimum
     budget: counts the evaluations, if given
     part: the problem compressed, where the minimum is to be known to a fraction of the noise only
     """
@@ -202,15 +200,18 @@ def fit(
         found = problem.fit_at(scaled, at)
         return found if lines is None else problem.compared(found)
 
-    raced = []
+    ends = []
     for start in starts:
         now = lines or problem
         at = project(np.clip(start, *box))
         if lines is not None and part is None:
             now = lines.filled(compared(at))
             at = project(at.nonlinear)
-        raced.append(compared(descend(project, at, box, _RACE_EVALUATIONS)))
-    best = min(raced, key=lambda found: found.sum_of_squares)
+        ends.append(descend(project, at, box, _RACE_EVALUATIONS))
+    if part:  # all starts have the same sums
+        ends = [min(ends, key=lambda end: float(end.residual @ end.residual))]
+    best = min(map(compared, ends), key=lambda found: found.sum_of_squares)
+    evaluations = _FINISH_EVALUATIONS
     for _ in range(_REFILLED):
         now = problem if lines is None else lines.filled(best)
         found = compared(descend(project, project(best.nonlinear), box, evaluations))

@@ -18,6 +18,8 @@ from omsm_ros.core.streams.blocks import FloatArray
 
 # Range of time constants in e-folds around the bandwidth of the motion, a factor of 9e6.
 _LOG_RANGE = 16.0
+# Frequencies over which the power of a response is averaged.
+_LINES = 2000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,3 +182,8 @@ class Fit:
     def dynamics(self) -> TransferFunction:
         """G(s) with G(0) = 1."""
         return self.scaled.transfer_function(self.nonlinear, self.numerator)
+
+    def mean_power(self, period: float) -> float:
+        """Return the mean square of gain times |G| up to half the sampling rate, 1 / 2 period."""
+        lines = np.linspace(0, 0.5 / period, _LINES)
+        return float(np.mean(np.abs(self.gain * self.dynamics.response(lines)) ** 2))

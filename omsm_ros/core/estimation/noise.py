@@ -34,9 +34,9 @@ from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 
 # Standard deviations beyond which an excess or a correlation is significant: 6e-7 by chance.
-_CLEARLY = 5.0
+CLEARLY = 5.0
 # Stationary samples needed: their variance is then known to 10 %.
-_LEAST_STILL = 200
+LEAST_STILL = 200
 # Part of the greatest squared rate below which the axis counts as stationary.
 _STILL = 1e-4
 # Orders of differences: the remainder of a smooth motion falls with the order, noise does not.
@@ -115,8 +115,8 @@ def timing_variance(on_grid: FloatArray, rate: FloatArray, *, noisy: bool = Fals
     moving = (square > _STILL * np.max(square)) & np.isfinite(on_grid)
     product = np.where(moving, on_grid, 0.0)
     product = product[1:] * product[:-1]
-    persists = np.sum(product) > _CLEARLY * float(np.linalg.norm(product))
-    if np.sum(still) < _LEAST_STILL or persists:
+    persists = np.sum(product) > CLEARLY * float(np.linalg.norm(product))
+    if np.sum(still) < LEAST_STILL or persists:
         return 0.0
     at_rest = float(np.mean(second[still] ** 2))
     if noisy:
@@ -127,7 +127,7 @@ def timing_variance(on_grid: FloatArray, rate: FloatArray, *, noisy: bool = Fals
     # Relative variance of the excess, and of the stationary noise that is subtracted.
     known_to = 1 / total + (float(np.sum(weight)) / total) ** 2 / float(np.sum(still))
     spread = at_rest * np.sqrt(2 * _SHARED * known_to)
-    return found if found > _CLEARLY * spread else 0.0
+    return found if found > CLEARLY * spread else 0.0
 
 
 def motion_scatter(motion: FloatArray, rate: FloatArray) -> float:
@@ -148,7 +148,7 @@ def _scatter_of_differences(motion: FloatArray, rate: FloatArray, order: int) ->
     square = np.convolve(motion, kernel, "valid") ** 2
     weight = np.convolve(rate**2, kernel**2, "valid")
     still = weight < _STILL * np.max(weight, initial=0.0)
-    if np.sum(still) < _LEAST_STILL:
+    if np.sum(still) < LEAST_STILL:
         return 0.0
     excess = float(np.sum(weight * (square - np.mean(square[still]))))
     return float(np.sqrt(max(excess, 0.0) / np.sum(weight**2)))
@@ -274,15 +274,15 @@ def _followed(
     odd, left = (each - _shares(made, each, band)[0][band] * made for each in (direct, seen))
     whole = np.zeros_like(band)
     (alike,), (chance,) = _shares(odd, left, whole)
-    alike = float(alike) if alike > _CLEARLY * chance else 0.0
+    alike = float(alike) if alike > CLEARLY * chance else 0.0
     found, known_to = _shares(made, seen - alike * direct, band)
     order = np.argsort(found)
     total = np.cumsum(1 / known_to[order])
     median = found[order][np.searchsorted(total, 0.5 * total[-1])]
-    own = np.abs(found - median) > _CLEARLY * known_to
+    own = np.abs(found - median) > CLEARLY * known_to
     weight = np.where(own, 0.0, known_to**-2.0)
     share = np.where(own, found, np.sum(weight * found) / np.sum(weight))
-    known_to = _CLEARLY * np.where(own, known_to, np.sum(weight) ** -0.5)
+    known_to = CLEARLY * np.where(own, known_to, np.sum(weight) ** -0.5)
     share = np.where(share > 1 - known_to, 1.0, np.where(share < known_to, 0.0, share))
     return np.asarray(share[band], np.float64), alike
 
@@ -377,7 +377,7 @@ def _mean_before(values: FloatArray, noise: float) -> tuple[FloatArray, FloatArr
 # Blocks of a record: slower than two of them, a random walk exceeds white noise if it matters.
 _WALK_BLOCKS = 128
 # Log odds that are very strong evidence (Kass and Raftery 1995).
-_VERY_STRONG = 5.0
+VERY_STRONG = 5.0
 # A direction that the fit follows by less than this is rounding.
 _FOLLOWED = 1e-6
 # Variance ratios tried of walk to white noise over a record: from not visible to nothing else.
@@ -443,7 +443,7 @@ class RandomWalk:
         if len(rows):
             with_rows, white_then, together = self._likelihood(residual, rows)
             explained, price = 2 * float(np.max(together) - np.max(alone)), np.log(len(self.ratios))
-            if 0.5 * (explained - len(rows) * price) > _VERY_STRONG:
+            if 0.5 * (explained - len(rows) * price) > VERY_STRONG:
                 restricted, white = with_rows, white_then
                 if 2 * np.max(with_rows - with_rows[0]) < price:
                     return 0.0, explained

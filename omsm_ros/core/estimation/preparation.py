@@ -37,8 +37,8 @@ from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, DataError, IdentificationError, StepTestError
 from omsm_ros.linear_algebra import least_squares
 
-# Time after which the motion before the record has no effect.
-_SETTLING_S = 50e-3
+# Time after which earlier motion has no effect.
+SETTLING_S = 50e-3
 # Samples at the end that interpolation needs as neighbours.
 _EDGE_GUARD = 8
 # Fade of a moving end and its Kaiser shape, which keeps the content within 4 / time, to 1e-6.
@@ -137,7 +137,7 @@ def _bridged(motion: FloatArray) -> tuple[FloatArray, int]:
 
 
 def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
-    samples, settling = len(record), round(_SETTLING_S / record.sample_period)
+    samples, settling = len(record), round(SETTLING_S / record.sample_period)
     used = record.ok.copy()
     if record.z_lost is not None:  # the response depends on lost positions
         ahead = np.pad(record.z_lost, (0, _EDGE_GUARD))
@@ -314,8 +314,6 @@ _SEEN = 0.25
 # Share of moving samples at which the speed changes. A ramp of a planned motion advances evenly but
 # for its ends, less than 0.2; rounded motions gave 0.4 to 1.
 _UNEVEN = 0.3
-# Frequencies over which |G|² is averaged.
-_FREQUENCIES = 2000
 
 
 def check_axis_steps(prepared: Prepared) -> None:
@@ -339,9 +337,8 @@ def check_axis_steps(prepared: Prepared) -> None:
     plain = fit(problem, _PLAIN, [resonance, *starts])
     moving = prepared.steps.moving[problem.used]
     left = float(np.mean(plain.residual[moving] ** 2)) - noise**2 if np.any(moving) else 0.0
-    lines = np.linspace(0, 0.5 / problem.period, _FREQUENCIES)
-    passed = float(np.mean(np.abs(plain.gain * plain.dynamics.response(lines)) ** 2))
-    low, high = (part * passed * step**2 / 12 for part in _AS_ROUNDING)
+    passed = plain.mean_power(problem.period) * step**2 / 12
+    low, high = (part * passed for part in _AS_ROUNDING)
     if left > _SEEN * noise**2 and low < left < high:
         residual = float(np.sqrt(left))
         raise IdentificationError(

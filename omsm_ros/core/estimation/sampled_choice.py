@@ -19,6 +19,7 @@ from omsm_ros.core.estimation.covariance import autoregression
 from omsm_ros.core.estimation.impulse_response import coherent_power, gram_of, impulse_response
 from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, ParallelSections
 from omsm_ros.core.estimation.sampled_fit import (
+    RACE,
     RATE,
     SampledRecord,
     SectionsFit,
@@ -60,8 +61,8 @@ _LEAST_SAMPLES_EACH = 3
 _MOST_SAMPLES = 1_000_000
 # Used samples of all records together on which orders are explored.
 EXPLORED_ON = 8000
-# Iterations of a start in a race, of an explored, of a refitted and of the final fit.
-_RACE, _EXPLORING, _REFITTED, _FINAL = 3, 12, 4, 30
+# Iterations of an explored, of a refitted and of the final fit.
+_EXPLORING, _REFITTED, _FINAL = 12, 4, 30
 # Directions weaker than this part of the power of the strongest are rounding of six digits.
 _UNEXCITED = 1e-12
 # The comparator's record: half its sampling rate over the frequency below which this share of the
@@ -306,7 +307,7 @@ def _explore(
     late = lag.problem.late(lag.nonlinear, lag.order)
     for order in sorted(n for n in {*_ORDERS, asked} if n <= most):
         starts = _starts(early, fits, best, order, late)
-        raced = [early.fit(order, [start], _RACE) for start in starts]
+        raced = [early.fit(order, [start], RACE) for start in starts]
         chosen = min(raced, key=lambda one: _missed(one, whole))
         fits.append(early.fit(order, [chosen.nonlinear], _EXPLORING))
         missed.append(_missed(fits[-1], whole))

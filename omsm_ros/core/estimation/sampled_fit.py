@@ -44,7 +44,7 @@ _EXCITED = 1e-3
 # Most lines of one record for vector fitting, evenly among the excited ones.
 _MOST_LINES = 4000
 # Iterations of vector fitting: by then it has converged, or will not; of each start in a race.
-_RELOCATIONS, _RACE = 10, 3
+_RELOCATIONS, RACE = 10, 3
 # Damping ratio of pairs at a start, those that are tried for a line of the residual, and the lines.
 _START_DAMPING, _ADDED_DAMPINGS, _TRIED_LINES = 0.05, (0.002, 0.01, 0.05), 40
 
@@ -253,7 +253,7 @@ class SectionsProblem:
 
         tried = [project(np.clip(start, *box)) for start in starts]
         if len(tried) > 1:
-            tried = [descend(project, one, box, _RACE) for one in tried]
+            tried = [descend(project, one, box, RACE) for one in tried]
         best = min(tried, key=lambda one: float(one.residual @ one.residual))
         best = descend(project, best, box, evaluations)
         linear = best.linear.reshape(self.inputs, -1)

@@ -14,6 +14,7 @@ from scipy import signal
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import NOTE, RESERVATION, Finding
+from omsm_ros.core.identification.sampled_identification import MAY_DIFFER
 from omsm_ros.core.kinematics.trajectories import MultisinePlan
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, response_band
 from omsm_ros.core.lti.transfer_function import ComplexArray
@@ -25,8 +26,6 @@ from omsm_ros.errors import IdentificationError
 _MOST_LOST = 0.01
 # Least correlation of the motion with the plan.
 _LEAST_CORRELATION = 0.8
-# Share of lines that may differ by chance or by a small error of the model.
-_MAY_DIFFER = 0.1
 # Ratio of the ends of a band whose distortion is stated.
 _BAND = 2 ** (1 / 3)
 
@@ -155,7 +154,7 @@ def multisine_findings(
     low, high = float(found.frequency[0]), float(min(found.frequency[-1], calibration.valid_up_to))
     values = {"share": float(np.mean(differs)) if len(differs) else 0.0, "low": low, "high": high}
     values["largest"] = float(np.max(apart, initial=0.0))
-    agrees = values["share"] <= _MAY_DIFFER
+    agrees = values["share"] <= MAY_DIFFER
     code = "identification.multisine_agrees" if agrees else "identification.multisine_differs"
     yield Finding(code, NOTE if agrees else RESERVATION, values)
     distortion = 2 * found.total_distortion

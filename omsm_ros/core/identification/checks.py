@@ -12,6 +12,7 @@ import numpy as np
 from omsm_ros.core.calibration.certificate import REJECTS, RESERVATION, WARNING, Finding
 from omsm_ros.core.calibration.plausibility import check_covariance, check_dynamics
 from omsm_ros.core.estimation.covariance import gain_uncertainty_alone
+from omsm_ros.core.estimation.noise import CLEARLY
 from omsm_ros.core.identification.covariance_terms import inter_sample_delay_bound
 from omsm_ros.core.identification.evidence import IdentificationEvidence
 from omsm_ros.core.identification.model_error_checks import accuracy_on, model_errors
@@ -33,8 +34,6 @@ WORST_AGREEMENT = 2.5
 WORST_CHI_SQUARE = 1.3
 # Below it the readings of a stationary axis are noisier than in motion: a mode still rings.
 LEAST_CHI_SQUARE = 0.3
-# Standard uncertainties beyond which a lag is not due to chance.
-_SIGNIFICANT = 5.0
 # Exposure, averaging and transmission of a probe take milliseconds, of a slow one some samples.
 _LONGEST_LAG_S, _LONGEST_LAG_SAMPLES = 0.1, 5.0
 # Linear probes are right to one per cent; one that sees Z at 10° reads 0.985 of it.
@@ -80,7 +79,7 @@ def latency(e: IdentificationEvidence) -> Findings:
     uncertainty = low_frequency_delay_uncertainty(e.dynamics, e.known.covariance)
     left, by_noise = e.lag_in_residual
     lead, uncertainty = -lag - left, max(uncertainty, by_noise)
-    if lead >= max(_SIGNIFICANT * uncertainty, e.use.harmless_delay_s):
+    if lead >= max(CLEARLY * uncertainty, e.use.harmless_delay_s):
         noise = {"encoder_noise_m": e.prepared.steps.noise, "probe_noise_m": e.residual.noise}
         if noise["encoder_noise_m"] > noise["probe_noise_m"]:
             yield Finding("identification.exchanged_channels", REJECTS, {"lead_s": lead} | noise)
@@ -202,7 +201,7 @@ def consistency(e: IdentificationEvidence) -> Findings:
 def late_reference(e: IdentificationEvidence) -> Findings:
     """Reject a reference that is clearly late, or early, against the encoder."""
     lag, harmless = e.reference, e.use.harmless_delay_s
-    if lag is None or abs(lag.value) <= max(_SIGNIFICANT * lag.uncertainty, harmless):
+    if lag is None or abs(lag.value) <= max(CLEARLY * lag.uncertainty, harmless):
         return
     code = "identification.late_reference" if lag.value > 0 else "identification.early_reference"
     values = {"lag_s": abs(lag.value), "uncertainty_s": lag.uncertainty}

@@ -7,13 +7,9 @@ import numpy as np
 
 from omsm_ros.core.estimation.steps import Edge
 from omsm_ros.core.identification.identify import Identification
+from omsm_ros.core.identification.residual_tests import LEAST_SEGMENT, SEGMENT_S
 from omsm_ros.core.lti.frequency_response import FrequencyResponse, frequency_response
 from omsm_ros.core.streams.blocks import FloatArray
-
-# Resolves 1 Hz; a step test has a few edges in each segment.
-_SEGMENT_S = 1.0
-# Eight lines; fewer show no response.
-_LEAST_SEGMENT = 16
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -49,8 +45,8 @@ def fitted_record(identified: Identification) -> FittedRecord:
     problem, fit = identified.prepared.problem, identified.fit
     modelled = problem.response(fit)
     residual = problem.on_grid(fit.residual, np.nan)
-    segment, measured = round(_SEGMENT_S / problem.period), None
-    if _LEAST_SEGMENT <= segment <= len(residual) // 2:
+    segment, measured = round(SEGMENT_S / problem.period), None
+    if LEAST_SEGMENT <= segment <= len(residual) // 2:
         output = modelled + np.nan_to_num(residual / fit.gain)
         measured = frequency_response(problem.input, output, problem.period, segment)
     return FittedRecord(

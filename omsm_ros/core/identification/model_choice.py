@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -28,14 +29,13 @@ from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.residual_tests import noise_colour
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.core.model_errors.families import FASTEST_CREEP_S
+from omsm_ros.core.model_errors.residual_diagnostics import SPANNED
 from omsm_ros.linear_algebra import orthonormal
 
 # χ² that each column must explain to be significant: four sigma.
 _CLEARLY_SHOWN = 16.0
 # Decay times after which a response is over.
-_OVER = 10.0
-# Directions weaker than this part of the strongest are rounding.
-_SPANNED = 1e-6
+OVER = 10.0
 
 
 def has_initial_response(
@@ -50,14 +50,14 @@ def has_initial_response(
     if problem.fits_initial_condition or fitted.structure.poles == 0 or len(counted) == 0:
         return False
     first = float(counted[0]) * problem.period
-    if float(np.min(-fitted.dynamics.poles().real)) * first > _OVER:
+    if float(np.min(-fitted.dynamics.poles().real)) * first > OVER:
         return False
     if not at_rest:
         return True
     columns = problem.initial_condition_response(fitted)[problem.used]
     # The fit already contains the part of a decay that is collinear with its parameters.
     known = problem.sensitivity(fitted)
-    spanned = orthonormal(np.column_stack([columns, known]), _SPANNED)
+    spanned = orthonormal(np.column_stack([columns, known]), SPANNED)
     explained = float(np.sum((fitted.residual @ spanned) ** 2))
     rest = fitted.sum_of_squares - explained
     size = spanned.shape[1] - known.shape[1]
@@ -93,12 +93,14 @@ def choose_model(
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget, part=part)
     known = {c.fit.structure: c.fit for c in before.candidates} if before else {}
     points = StartingPoints(part or problem, lag)
+    # Structures in a row often start from the sums that the same fit has filled.
+    refilled = lru_cache(maxsize=1)(part.filled) if part else None
 
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
         same = known.get(structure)
         starts = points.of(structure, smaller) if same is None else [same.nonlinear]
         best = min(smaller, key=lambda fit: fit.sum_of_squares, default=lag)
-        filled = part and part.filled(best)
+        filled = refilled and refilled(best)
         return fit(problem, structure, starts, budget=budget, part=filled)
 
     colour = noise_colour(problem, lag, prepared.steps)

@@ -21,6 +21,7 @@ from omsm_ros.core.calibration.certificate import (
 )
 from omsm_ros.core.estimation.covariance import parameter_covariance
 from omsm_ros.core.estimation.model_order import fit
+from omsm_ros.core.estimation.noise import VERY_STRONG
 from omsm_ros.core.identification.evidence import IdentificationEvidence
 from omsm_ros.core.identification.model_error_search import ModelledTerm, SearchResult
 from omsm_ros.core.lti.frequency_response import response_band
@@ -71,11 +72,6 @@ _MAY_LOOK_ALIKE = {
     DRIFT: "drift",
     CREEP: "creep",
 }
-# Log odds below which the data do not decide between two of them. None of the terms is exactly what
-# a machine does, so this is twice what counts as very strong (Kass and Raftery 1995).
-_UNDECIDED = 10.0
-# Iterations of the fit without a term.
-_REFITTED = 3
 # Name of the parameter of a family in the values of a finding.
 _PARAMETERS = {
     CREEP: "time_constant_s",
@@ -133,13 +129,14 @@ def _alike(searched: SearchResult, modelled: ModelledTerm) -> list[str]:
     kept = np.ones(problem.background.shape[1], np.bool_)
     kept[modelled.columns] = False
     without = replace(problem, background=problem.background[:, kept])
-    again = fit(without, fitted.structure, [fitted.nonlinear], _REFITTED)
+    again = fit(without, fitted.structure, [fitted.nonlinear])
     tested = ResidualDiagnostics(without, again, searched.prepared.steps, {*_MAY_LOOK_ALIKE})
-    own = tested.evidence(tested.tested(modelled.term))
+    # None of the terms is exactly what a machine does: twice what counts as very strong decides.
+    least = tested.evidence(tested.tested(modelled.term)) - 2 * VERY_STRONG
     return [
         name
         for name, test in tested.best.items()
-        if name != modelled.term.family and tested.evidence(test) > own - _UNDECIDED
+        if name != modelled.term.family and tested.evidence(test) > least
     ]
 
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from omsm_ros.core.estimation.model_order import Candidate, fit, information
+from omsm_ros.core.estimation.model_order import Candidate, fit, identifiable, information
 from omsm_ros.core.estimation.model_structure import Fit
-from omsm_ros.core.estimation.noise import correct_errors_in_variables
+from omsm_ros.core.estimation.noise import VERY_STRONG, correct_errors_in_variables
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.preparation import Prepared
-from omsm_ros.core.identification.model_choice import ChosenModel
+from omsm_ros.core.identification.model_choice import OVER, ChosenModel
 from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.model_errors.families import (
     BACKLASH,
@@ -38,13 +38,6 @@ _NUISANCE_FAMILIES = {BACKLASH, DRIFT, FRICTION, LINEARITY, PERIODIC, VIBRATION}
 # Families whose columns depend on the fitted response, and improve it.
 _TURNING = {BACKLASH, FRICTION}
 _SLOW = {BACKLASH, CREEP, DRIFT, FRICTION, LINEARITY}
-# Log odds below which two families count as equal (Kass and Raftery 1995: very strong).
-_UNDECIDED = 5.0
-# Fewest decay times in a record: a slower decay is a drift.
-_LEAST_DECAYS = 1.0
-# Decay times in a record below which the start of the period contains the response to its end:
-# after seven a thousandth remains.
-_SETTLED_DECAYS = 7.0
 # Most poles of a simple model, a structure and its roll-off; nonlinearity looks like many more.
 _PLAIN_POLES = 2
 # Factors on the poles of a mode at which a fit starts: tested modes are six per cent apart.
@@ -271,7 +264,7 @@ def _select_nuisance_terms(
         other
         for other in shown[1:]
         if {first.term.family, other.term.family} <= _SLOW
-        and diagnostics.evidence(other) > diagnostics.evidence(first) - _UNDECIDED
+        and diagnostics.evidence(other) > diagnostics.evidence(first) - VERY_STRONG
     ]
     chosen = [judged for judged in (first, *equals) if judged.term.family in _NUISANCE_FAMILIES]
     turning = [judged for judged in chosen if judged.term.family in _TURNING]
@@ -303,13 +296,13 @@ def _grown(
         return None
     problem, new = prepared.problem, poles_of(term)
     duration = len(problem.input) * problem.period
-    if term.family == CREEP or np.min(-new.real) * duration < _SETTLED_DECAYS:
+    if term.family == CREEP or np.min(-new.real) * duration < OVER:
         # The response to the end of the record reaches the start of the period.
         problem = replace(problem, fits_initial_condition=True)
     starts = (1.0,) if term.family == CREEP else _MODE_FREQUENCY_RATIOS
     chosen = model.chosen.fit
     larger = fit_with_added_poles(problem, chosen, new, starts, budget)
-    if larger is None or np.min(-larger.dynamics.poles().real) * duration <= _LEAST_DECAYS:
+    if larger is None or not identifiable(larger.dynamics, problem.period, duration):
         return None
     best = Candidate(larger, information(larger))
     if problem is not prepared.problem:

@@ -14,6 +14,7 @@ from omsm_ros.core.estimation.covariance import autoregression
 from omsm_ros.core.estimation.impulse_response import gram_of
 from omsm_ros.core.estimation.model_structure import Fit
 from omsm_ros.core.estimation.noise import (
+    LEAST_STILL,
     motion_error_variance,
     motion_scatter,
     rate_of,
@@ -21,27 +22,22 @@ from omsm_ros.core.estimation.noise import (
     scatter_in_time,
 )
 from omsm_ros.core.estimation.output_error import Problem
+from omsm_ros.core.estimation.preparation import SETTLING_S
 from omsm_ros.core.estimation.steps import Steps, extended
 from omsm_ros.core.lti.frequency_response import frequency_response
+from omsm_ros.core.model_errors.residual_diagnostics import LAGS
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.statistics import white_noise
+from omsm_ros.linear_algebra import inverse_root
 
-# As resid of the System Identification Toolbox takes.
-_LAGS = 25
-# The response after an edge is tested for this long.
-_AFTER_EDGE_S = 50e-3
-# Then a standard deviation is known to a twentieth.
-_LEAST_STATIONARY_SAMPLES = 200
 # Then it is known to a tenth.
 _LEAST_CROSSINGS = 50
-# Up to half the sampling rate, for the mean power of a response.
-_LINES = 500
 # Shares of an excess that explain it, and of the noise that are worth telling.
 _MOST, _SHOWS = 0.5, 0.1
 # Below the resolution of any probe; a misfit below it is none.
 _FINEST_READING_M = 1e-10
-# Resolves 1 Hz.
-_AGREEMENT_SEGMENT_S = 1.0
+# Resolves 1 Hz; a step test has a few edges in each segment. Fewer than eight lines show nothing.
+SEGMENT_S, LEAST_SEGMENT = 1.0, 16
 # A response that is the mean of fewer segments is known to a third at best.
 _LEAST_SEGMENTS = 8
 
@@ -102,9 +98,7 @@ def _axis_timing(
     # Noise removed only where the axis is stationary would look like scatter in motion.
     recorded = problem.input if problem.recorded is None else problem.recorded
     scatter = motion_scatter(recorded, rate)
-    lines = np.linspace(0.0, 0.5 / problem.period, _LINES)
-    passed = float(np.mean(np.abs(fitted.gain * fitted.dynamics.response(lines)) ** 2))
-    makes = scatter**2 * float(np.mean(rate[moves] ** 2)) * passed
+    makes = scatter**2 * float(np.mean(rate[moves] ** 2)) * fitted.mean_power(problem.period)
     return scatter if makes > max(_MOST * excess, _SHOWS * noise**2) else 0.0
 
 
@@ -113,7 +107,7 @@ def noise_colour(problem: Problem, fitted: Fit, steps: Steps) -> float:
     on_grid = problem.output - problem.modelled(fitted)
     rest = on_grid[problem.used & ~_active(steps, problem.period)]
     # Rounded readings of a stationary axis hardly change and have no spectrum of noise.
-    if len(rest) < _LEAST_STATIONARY_SAMPLES or problem.shared > 0:
+    if len(rest) < LEAST_STILL or problem.shared > 0:
         return 1.0
     rest = rest - np.mean(rest)
     coefficients, variance = autoregression(rest)
@@ -122,16 +116,16 @@ def noise_colour(problem: Problem, fitted: Fit, steps: Steps) -> float:
 
 
 def _active(steps: Steps, period: float) -> BoolArray:
-    return extended(steps.moving, round(_AFTER_EDGE_S / period))
+    return extended(steps.moving, round(SETTLING_S / period))
 
 
 def _noise(on_grid: FloatArray, used: BoolArray, rest: BoolArray) -> float:
-    if np.sum(rest) >= _LEAST_STATIONARY_SAMPLES:
+    if np.sum(rest) >= LEAST_STILL:
         return float(np.std(on_grid[rest]))
     return white_noise(on_grid[used])
 
 
-def whiteness(residual: FloatArray, lags: int = _LAGS) -> float:
+def whiteness(residual: FloatArray, lags: int = LAGS) -> float:
     """Return the p-value of Ljung and Box's portmanteau test that ``residual`` (k,) is white."""
     n = len(residual)
     products = [residual[lag:] @ residual[: n - lag] for lag in range(lags + 1)]
@@ -140,7 +134,7 @@ def whiteness(residual: FloatArray, lags: int = _LAGS) -> float:
     return float(stats.chi2.sf(statistic, lags))
 
 
-def independence(residual: FloatArray, drive: FloatArray, lags: int = _LAGS) -> float:
+def independence(residual: FloatArray, drive: FloatArray, lags: int = LAGS) -> float:
     """Return p-value that ``residual`` (k,) does not follow ``drive`` (k,), the motion's rate.
 
     The residual is regressed on the last ``lags`` values of the drive, which are correlated;
@@ -148,11 +142,9 @@ def independence(residual: FloatArray, drive: FloatArray, lags: int = _LAGS) -> 
     """
     rest = residual[lags - 1 :]
     gram, moment = gram_of(drive[:, np.newaxis], rest, lags)
-    values, directions = np.linalg.eigh(gram)
-    kept = values > 1e-12 * values[-1]
-    statistic = float(np.sum((directions.T @ moment)[kept] ** 2 / values[kept]))
-    statistic /= float(np.mean(rest**2)) or 1.0
-    return float(stats.chi2.sf(statistic, np.sum(kept))) if np.any(kept) else 1.0
+    root = inverse_root(gram)
+    statistic = float(np.sum((root.T @ moment) ** 2)) / (float(np.mean(rest**2)) or 1.0)
+    return float(stats.chi2.sf(statistic, root.shape[1])) if root.size else 1.0
 
 
 def response_difference(problem: Problem, best: Fit, up_to: float) -> float | None:
@@ -166,8 +158,8 @@ def response_difference(problem: Problem, best: Fit, up_to: float) -> float | No
     residual for noise that is alike everywhere, which rounding without noise is not.
     """
     residual = problem.on_grid(best.residual, 0.0)
-    segment = min(round(_AGREEMENT_SEGMENT_S / problem.period), len(residual) // _LEAST_SEGMENTS)
-    found = frequency_response(problem.input, residual, problem.period, max(segment, 16))
+    segment = min(round(SEGMENT_S / problem.period), len(residual) // _LEAST_SEGMENTS)
+    found = frequency_response(problem.input, residual, problem.period, max(segment, LEAST_SEGMENT))
     lines = (found.frequency > 0) & (found.frequency <= up_to)
     if problem.shared > 0 or not np.any(lines):
         return None

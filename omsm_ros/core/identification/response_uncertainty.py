@@ -8,11 +8,13 @@ from scipy import fft, linalg, signal
 
 from omsm_ros.core.estimation.covariance import noise_spectrum, parameter_covariance
 from omsm_ros.core.estimation.model_structure import Fit
+from omsm_ros.core.estimation.noise import VERY_STRONG
 from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.covariance_terms import COVARIANCE_TERMS
 from omsm_ros.core.identification.model_choice import ChosenModel
 from omsm_ros.core.lti.frequency_response import (
+    GRID_POINTS,
     Band,
     ResponseLimits,
     excited_up_to,
@@ -21,11 +23,6 @@ from omsm_ros.core.lti.frequency_response import (
     widening,
 )
 from omsm_ros.core.streams.blocks import FloatArray
-
-# On a logarithmic grid over four decades: neighbours 2.3 % apart.
-_FREQUENCIES = 400
-# Kass and Raftery: a difference in BIC above this is very strong evidence.
-_EQUALLY_GOOD_BIC = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +123,7 @@ def inflate_to_free_choice(
     )
     covariance = factor**2 * known.covariance
     band = response_band(mine.dynamics, covariance, lines)
-    better = free.chosen.bic < model.chosen.bic - _EQUALLY_GOOD_BIC
+    better = free.chosen.bic < model.chosen.bic - 2 * VERY_STRONG
     return replace(
         known,
         covariance=covariance,
@@ -142,7 +139,8 @@ def _trusted_up_to(model: ChosenModel, band: Band, limits: ResponseLimits, shown
     gain, phase = np.zeros(len(chosen)), np.zeros(len(chosen))
     best = min(c.bic for c in model.candidates)
     for other in model.candidates:
-        if other.bic < best + _EQUALLY_GOOD_BIC:
+        # BIC is twice the log odds.
+        if other.bic < best + 2 * VERY_STRONG:
             difference = np.log(other.fit.dynamics.response(band.frequency) / chosen)
             gain = np.maximum(gain, np.abs(difference.real))
             phase = np.maximum(phase, np.abs(difference.imag))
@@ -173,4 +171,4 @@ def _symmetric(matrix: FloatArray) -> FloatArray:
 
 def _frequencies(problem: Problem) -> FloatArray:
     nyquist = 0.5 / problem.period
-    return np.asarray(np.geomspace(1e-4 * nyquist, nyquist, _FREQUENCIES))
+    return np.asarray(np.geomspace(1e-4 * nyquist, nyquist, GRID_POINTS))

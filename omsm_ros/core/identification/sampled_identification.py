@@ -33,8 +33,9 @@ from omsm_ros.core.estimation.sampled_model import (
 )
 from omsm_ros.core.estimation.steps import LEAST_SAMPLES
 from omsm_ros.core.identification.residual_tests import independence, whiteness
-from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, Band, ResponseLimits
+from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, GRID_POINTS, Band, ResponseLimits
 from omsm_ros.core.lti.transfer_function import ComplexArray
+from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.errors import ConfigurationError, IdentificationError, Notice
 from omsm_ros.linear_algebra import one_blas_thread
@@ -44,11 +45,6 @@ SAMPLED_LIMITS = ResponseLimits(gain=0.1, phase=0.1)
 _LIMIT = min(SAMPLED_LIMITS.gain, SAMPLED_LIMITS.phase)
 # Least share of the variance of held-out parts that free runs predict.
 _LEAST_PREDICTED = 0.5
-# Least p-value of a residual that is independent of the input.
-_LEAST_INDEPENDENCE_P = 1e-4
-# Frequencies from the lowest line of the longest record to the last below half the sampling rate,
-# where a pole may change the response that no line shows: neighbours are 2 to 3 % apart.
-_FREQUENCIES = 400
 # Number of lines in a block, added number for each input, largest ratio of its frequencies.
 _LINES, _LINES_PER_INPUT, _BLOCK_RATIO = 12, 8, 1.5
 # Power of a line over the largest nearby, and over the largest of all, below which it is left out.
@@ -62,7 +58,7 @@ _COLLINEAR = 1e-3
 _STRONG = 0.1
 # Standard uncertainties beyond which a difference is not chance, and the largest share of blocks
 # near a frequency that may differ.
-_SIGNIFICANT, _MAY_DIFFER = 3.0, 0.1
+_SIGNIFICANT, MAY_DIFFER = 3.0, 0.1
 # Half the width of what is near a frequency [octaves].
 _NEAR_OCTAVES = 1 / 6
 
@@ -92,7 +88,9 @@ def identify_samples(
     fitted = choice.chosen.fit
     sections = fitted.model(period, fitted.problem.covariance(fitted, period))
     longest = max(len(record) for record in records)
-    frequency = np.geomspace(1, longest / 2 - 1, _FREQUENCIES) / (longest * period)
+    # From the lowest line to the last below half the sampling rate, where a pole may change the
+    # response that no line shows.
+    frequency = np.geomspace(1, longest / 2 - 1, GRID_POINTS) / (longest * period)
     sections, factor = _inflated(sections, choice, frequency)
     blocks = _blocks(choice.chosen, period)
     missed, follows = _missed(choice.chosen, frequency * period)
@@ -300,7 +298,7 @@ def valid_range(
     count = np.maximum(np.sum(near, axis=1), 1.0)
     off = np.array([block.off[input] for block in blocks])
     lined = near * np.isfinite(off)
-    differs = lined @ np.nan_to_num(off) > _MAY_DIFFER * np.sum(lined, axis=1)
+    differs = lined @ np.nan_to_num(off) > MAY_DIFFER * np.sum(lined, axis=1)
     # One difference over a wide block does not show modes inside it.
     close = near * (highest <= _BLOCK_RATIO * lowest)
     # It is that of the stronger lines, and as large in a zero among them.
@@ -308,7 +306,7 @@ def valid_range(
     level = np.array([block.size[input] for block in blocks]) / np.abs(response)[:, np.newaxis]
     within = np.maximum(level, 1.0) * (difference + COVERAGE_FACTOR * spread) <= _LIMIT
     agrees = np.any(close * within, axis=1)
-    agrees &= np.sum(close * ~within, axis=1) <= _MAY_DIFFER * np.sum(close, axis=1)
+    agrees &= np.sum(close * ~within, axis=1) <= MAY_DIFFER * np.sum(close, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         shown = near @ (1 / spread**2) >= (COVERAGE_FACTOR / _LIMIT) ** 2
         apart = np.max(np.abs(others / response - 1), axis=0, initial=0.0)
@@ -317,7 +315,7 @@ def valid_range(
     excited = np.logical_or.accumulate(shown) & np.logical_or.accumulate(shown[::-1])[::-1]
     # The narrow band of a model of too few poles is contradicted by differences beyond chance.
     upheld = special.gammaincc(count, excess) > np.exp(-(_SIGNIFICANT**2))
-    upheld |= np.sum(near * ~within, axis=1) <= _MAY_DIFFER * count
+    upheld |= np.sum(near * ~within, axis=1) <= MAY_DIFFER * count
     inside = (_narrow(sections.band(frequency, input), apart) & upheld) | agrees
     return _widest(frequency, inside & excited & ~differs)
 
@@ -353,10 +351,10 @@ def _certificate(
     accepted = Notice("estimation.accepted", low=low, high=high)
     if not high > low:
         accepted = Notice("estimation.accepted_apart")
-    if independent < _LEAST_INDEPENDENCE_P and follows > _LIMIT:
+    if independent < FALSE_ALARM and follows > _LIMIT:
         # Blocks take it for noise, and a sweep or lost readings spread it over all lines.
         reasons.append(Notice("estimation.missed_response", share=follows, limit=_LIMIT))
-    elif independent < _LEAST_INDEPENDENCE_P:
+    elif independent < FALSE_ALARM:
         warnings.append(Notice("estimation.residual_follows_input", p=independent))
     if order != free_order:
         warnings.append(
@@ -426,7 +424,7 @@ def _continuous_error(sections: ParallelSections, valid: tuple[float, float]) ->
     equivalent = sections.equivalent()
     if equivalent is None or not valid[1] > valid[0]:
         return None
-    lines = np.geomspace(*valid, _FREQUENCIES)
+    lines = np.geomspace(*valid, GRID_POINTS)
     with np.errstate(all="ignore"):
         ratio = equivalent.transfer_function().response(lines) / equivalent.response(lines)[0]
     error = float(np.max(np.abs(ratio - 1)))

@@ -36,12 +36,12 @@ def frequency_response(
     rate = 1 / sample_period
     options = {"fs": rate, "nperseg": min(segment, len(du)), "detrend": False}
     frequency, cross = scipy.signal.csd(du, dy, **options)
-    _, inward = scipy.signal.welch(du, **options)
-    _, coherence = scipy.signal.coherence(du, dy, **options)
+    inward, outward = (scipy.signal.welch(each, **options)[1] for each in (du, dy))
+    tiny = np.finfo(np.float64).tiny
+    coherence = np.abs(cross) ** 2 / np.maximum(inward * outward, tiny)
     count = max(2 * len(du) / options["nperseg"] - 1, 1.0)
     inside = np.clip(coherence, 1e-12, 1.0)
     uncertainty = np.sqrt((1 - inside) / (2 * inside * count))
-    tiny = np.finfo(np.float64).tiny
     return FrequencyResponse(
         frequency, np.asarray(cross / np.maximum(inward, tiny)), coherence, uncertainty
     )
@@ -49,6 +49,8 @@ def frequency_response(
 
 # Coverage factor for 95 % of a normal distribution.
 COVERAGE_FACTOR = 1.959964
+# Frequencies of a logarithmic grid: over four decades, neighbours are 2.3 % apart.
+GRID_POINTS = 400
 # Step of the trial frequencies [octaves].
 _SHOWN_STEP = 1 / 24
 

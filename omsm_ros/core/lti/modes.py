@@ -18,13 +18,15 @@ import scipy  # whose parts are loaded when they are used
 from numpy.polynomial import polynomial
 from numpy.typing import ArrayLike
 
-from omsm_ros.core.lti.frequency_response import relative_response_jacobian, spread_along
+from omsm_ros.core.lti.frequency_response import (
+    GRID_POINTS,
+    relative_response_jacobian,
+    spread_along,
+)
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import DataError, IdentificationError
 
-# Number of frequencies at which the modal terms are compared with the response.
-_LINES = 400
 # Order of the uncertainties of a fitted two-mass model; m1 is given.
 FITTED = ("m2", "k1", "k2", "c1", "c2")
 # Frequencies at which the shape of a response is read over three decades, 0.2 % apart: closer than
@@ -109,7 +111,7 @@ def modal_remainder(dynamics: TransferFunction, up_to: float) -> float | None:
     modes = known_modes(dynamics, np.zeros((size, size)))
     if all(mode.residue is None for mode in modes):
         return None
-    lines = np.linspace(0.0, up_to, _LINES)
+    lines = np.linspace(0.0, up_to, GRID_POINTS)
     whole = replace(dynamics, delay=0.0).normalised().response(lines)
     return float(np.max(np.abs(whole - modal_sum(modes, lines))) / np.max(np.abs(whole)))
 

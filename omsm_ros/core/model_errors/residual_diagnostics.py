@@ -37,12 +37,12 @@ from omsm_ros.core.model_errors.families import (
     ModelErrorTerm,
 )
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
-from omsm_ros.linear_algebra import BLOCK_ROWS, BLOCK_VALUES, unit_columns
+from omsm_ros.linear_algebra import BLOCK_ROWS, BLOCK_VALUES, inverse_root, tall_svd, unit_columns
 
 # A column with a weaker remainder is collinear with the fitted parameters but for rounding.
 _COLLINEAR_SHARE = 1e-4
 # Directions this much weaker than the strongest are rounding.
-_SPANNED = 1e-9
+SPANNED = 1e-9
 # Fewest lines over which noise is averaged: its level is then known to a quarter,
 _LEAST_LINES = 8
 # and the factor of frequency on either side where lines are dense, half an octave.
@@ -89,8 +89,8 @@ class ResidualSpace:
     def _decomposed(self) -> tuple[FloatArray, FloatArray]:
         """A basis (k, r) of the columns of the parameters, and its parameters (p, r)."""
         unit, scale = unit_columns(self.problem.sensitivity(self.fitted))
-        left, values, right = np.linalg.svd(unit, full_matrices=False)
-        kept = values > _SPANNED * values[0]
+        left, values, right = tall_svd(unit)
+        kept = values > SPANNED * values[0]
         return left[:, kept], right[kept].T / values[kept] / scale[:, np.newaxis]
 
     def collinear_parameters(self, column: FloatArray) -> FloatArray:
@@ -227,10 +227,8 @@ def smoothed_noise_spectrum(
 
 # Probability of a false alarm of one family; that of ten families is 1e-3.
 FALSE_ALARM = 1e-4
-# Lags [samples] of the rate of the motion that are tested for correlation.
-_LAGS = 25
-# A lagged rate weaker than this part of the strongest is rounding.
-_ABOVE_ROUNDING = 1e-6
+# Lags [samples] tested for correlation, as resid of the System Identification Toolbox takes.
+LAGS = 25
 # Largest share of moving samples of a step test that is decimated.
 _MOSTLY = 0.5
 # Families tested with all samples: reversals and lines need them, and their terms are few.
@@ -287,6 +285,8 @@ class ResidualDiagnostics:
         """Return the most significant term of each family, by the name of the family."""
         found: dict[str, ScoreTest] = {}
         for family in self.model_errors.families(self.only):
+            if family.name == DRIFT and family.width != (self._drift_columns or family.width):
+                continue
             term = self._best_of(family)
             if family.name == PERIODIC:
                 term = self._best_of(self.model_errors.periodic(term.parameter))
@@ -294,6 +294,15 @@ class ResidualDiagnostics:
             if before is None or self.evidence(judged) > self.evidence(before):
                 found[family.name] = judged
         return found
+
+    @cached_property
+    def _drift_columns(self) -> int | None:
+        """Number of columns of the best drift of the thinned record; None where there is none."""
+        if self.thinned is None:
+            return None
+        terms = (family.term(0) for family in self.thinned.model_errors.drift())
+        best = max(map(self.thinned.tested, terms), key=self.evidence)
+        return int(best.term.columns.shape[1])
 
     def tested(self, term: ModelErrorTerm) -> ScoreTest:
         """Return the test of ``term``."""
@@ -350,17 +359,15 @@ class ResidualDiagnostics:
     @cached_property
     def independence(self) -> float:
         """Return the p-value of the correlation of the residual with the rate of the motion."""
-        rate = np.concatenate([np.zeros(_LAGS - 1), np.gradient(self.problem.motion)])
+        rate = np.concatenate([np.zeros(LAGS - 1), np.gradient(self.problem.motion)])
         # The last values of the rate, the newest last, 0 before the record.
-        past = np.lib.stride_tricks.sliding_window_view(rate, _LAGS)
+        past = np.lib.stride_tricks.sliding_window_view(rate, LAGS)
         parts = range(0, len(past), BLOCK_ROWS)
         rows = (np.ascontiguousarray(past[i : i + BLOCK_ROWS]) for i in parts)
         gram = np.sum([part.T @ part for part in rows], axis=0)
-        powers, directions = np.linalg.eigh(gram)
-        kept = powers > _ABOVE_ROUNDING**2 * powers[-1]
-        if not np.any(kept):
+        mixed = inverse_root(gram)
+        if not mixed.size:
             return 1.0
-        mixed = directions[:, kept] / np.sqrt(powers[kept])
         columns = np.empty((mixed.shape[1], len(past)))
         for first in parts:
             columns[:, first : first + BLOCK_ROWS] = (past[first : first + BLOCK_ROWS] @ mixed).T

@@ -49,9 +49,6 @@ UNDETECTED = (CREEP, *_BENDING)
 
 # Decades of time between a structure's slowest motion and the length of a record.
 _DECADES = 3.0
-# Creep goes on beyond the record, by none to as much in each of three decades: a uniform
-# distribution, whose standard deviation is 1/√3 of its limit.
-_UNSEEN = _DECADES / 3**0.5
 # Slowest relaxation [s], and in durations of the record. A joint or a piezo creeps for about a
 # minute; slower creep moves less during a scan, and beyond ten records not even its start is
 # measurable. A drift of 100 nm a minute may be a relaxation of 50 s and 0.17 %; with 100 s it would
@@ -174,14 +171,16 @@ def _worst_relaxation(
         logarithm of time: that in the other decades of the record is at most a few times the fitted
         one, and bounds are limited to that.
     """
+    limit = _DECADES * found
     if found > 0:
-        limit = _DECADES * found
         relaxations = [
             replace(term, size=min(term.size, limit), uncertainty=min(term.uncertainty, limit))
             for term in relaxations
         ]
     worst = max(relaxations, key=lambda term: term.effect * term.carried)
-    slower = _UNSEEN * found
+    # Creep goes on beyond the record, by none to as much in each of three decades: a uniform
+    # distribution, whose standard deviation is 1/√3 of its limit.
+    slower = limit / 3**0.5
     # Many relaxations lag, and noise would mask a part of each: it counts what exceeds the noise.
     lags = [
         replace(
