@@ -71,6 +71,8 @@ _NEXT, _HALF_WAY, _AWAY, _ONE_SIDED = (0.7, 1.3), 0.5, (2.0, 3.5), 0.3
 _PEAKS, _SINGLE, _UNSEEN, _COMPANY = 6, 24, 0.05, 1 / 3
 # Most by which a summit that both neighbouring tracks miss exceeds what one track shows of it.
 MOST_UNSEEN = float(_UNSEEN ** -(_HALF_WAY**2))
+# Places about a peak up to the middle of four points of a raster, in distances of the tracks.
+_ABOUT = np.outer(np.arange(1, 7) / 8, np.exp(1j * np.arange(24) * np.pi / 12)).reshape(-1, 1)
 # Least singular value of a parabola through neighbours.
 _LEAST_SPREAD = 1e-2
 
@@ -306,7 +308,8 @@ def _rise(at: NDArray[np.complex128], values: FloatArray, peak: float, noise: fl
     """Return how far the summit of a Gaussian through ``values`` (n,) [m] exceeds their ``peak``.
 
     The summit is half way to the next track at most. Where the neighbouring tracks miss it, it is
-    there, and as wide as that allows.
+    there, and as wide as that allows. A cone is higher: form may rise from each place as steeply as
+    the peak falls to a neighbouring track (E. McShane, Bull. Am. Math. Soc. 40, 837).
 
     at: places about the peak in distances of the tracks (n,);  noise: of the peak [m]
     """
@@ -319,8 +322,10 @@ def _rise(at: NDArray[np.complex128], values: FloatArray, peak: float, noise: fl
     floor = max(2 * noise, _UNSEEN * height)
     if height <= floor:
         return 0.0
+    steepest = max(float(np.max((peak - values[ring]) / away[ring])), 0.0)
+    cone = float(np.max(np.min(values + steepest * np.abs(_ABOUT - at), axis=1))) - peak
     if np.median(values[ring]) <= peak - height + floor:
-        return float(height * ((height / floor) ** _HALF_WAY**2 - 1))
+        return max(float(height * ((height / floor) ** _HALF_WAY**2 - 1)), cone)
     near = (away > 0) & (away < _NEXT[1])
     fall = np.log(height / np.clip(height - peak + values[near], floor, height))
     u, v = at[near].real, at[near].imag
@@ -329,7 +334,8 @@ def _rise(at: NDArray[np.complex128], values: FloatArray, peak: float, noise: fl
     curved, ways = np.linalg.eigh([[a, b / 2], [b / 2, c]])
     slope, curved = np.abs(ways.T @ slope), np.maximum(curved, np.finfo(np.float64).tiny)
     way = np.minimum(slope / (2 * curved), _HALF_WAY)
-    return float(height * min(np.expm1(slope @ way - curved @ way**2), MOST_UNSEEN - 1))
+    gaussian = float(height * min(np.expm1(slope @ way - curved @ way**2), MOST_UNSEEN - 1))
+    return max(gaussian, cone)
 
 
 def _local_features(
@@ -444,6 +450,7 @@ def _smooth(map_: DeviationMap, disc: Aperture) -> ZernikeFit:
     squares = (weighted := columns * root) @ weighted.T
     unresolved = (2 + _CHANCE * np.sqrt(2 / len(map_))) * map_.noise**2  # noise and as much form
     finer = float(map_.area @ (map_.deviation**2 - unresolved))
+    next_: list[ZernikeIndex] = []
     for order, lower in zip(orders, [*orders[1:], -1], strict=True):
         terms = [term for term in every if term.n <= order]
         kept = separable(gram[: len(terms), : len(terms)], terms, _CONDITION)
@@ -458,6 +465,9 @@ def _smooth(map_: DeviationMap, disc: Aperture) -> ZernikeFit:
         most = found @ np.linalg.solve(solve[:, new], found) > finer - right[kept] @ fitted
         if most and chi_square > free + _CHANCE * np.sqrt(2 * free):
             break
+        next_ = terms if most else []
+    # What noise hides of the next orders is least certain at the rim, as their covariance tells.
+    terms = next_ or terms
     points, known = (map_.x, map_.y, map_.deviation), slice(len(terms))
     sums = gram[known, known], right[known, np.newaxis]
     return fit_zernikes(*points, terms, disc, weights=map_.area, condition=_CONDITION, sums=sums)
