@@ -232,8 +232,8 @@ class _Gaps(NamedTuple):
         parabola, plane = continued(places / spacing)
         weights = np.stack([parabola, (parabola - plane) / 2])
         every = np.stack([map_.x, map_.y]), map_.area / map_.area.sum(), outline, spacing
-        strip = RimStrip.of(*every, lambda x, _: np.ones((1, len(x))))
-        strip = None if outline.outline == "annulus" else strip
+        whole = outline.outline != "annulus"
+        strip = RimStrip.of(*every, lambda x, _: np.ones((1, len(x)))) if whole else None
         share = float(way[-1]) * spacing / abs(float(np.sum(u[:-1] * v[1:] - u[1:] * v[:-1])))
         return cls(map_.x, map_.y, spacing, some[near], weights, strip, share)
 
@@ -272,8 +272,6 @@ class _Gaps(NamedTuple):
         may, highest = values + (MOST_UNSEEN - 1) * np.maximum(above, 0.0), float(values.max())
         for _ in range(_PEAKS):
             peak = int(np.argmax(may))
-            if may[peak] <= highest:
-                break
             near, at = self._about(peak)
             rise = _rise(at, values[near], values[peak], float(noise[peak]))
             highest = max(highest, float(values[peak]) + rise)
@@ -497,8 +495,6 @@ def _drawn(
     noisy = still + noise * part.error[points, np.newaxis]
     errors = [effects[real_effects(map_)], root_of(part.smooth.covariance) @ terms]
     drawn = noisy + anew(np.concatenate(errors))
-    bounded = drawn + anew(effects[map_.bounds]) if len(map_.bounds) else drawn
-    if not len(taken):
-        return drawn, bounded, still, still, noisy
+    bounded = drawn + anew(effects[map_.bounds])
     likely, full = anew(root_of(map_.taken) @ taken), anew(taken)
     return drawn, bounded, still + likely, still + full, noisy
