@@ -42,6 +42,7 @@ verdict.shrink: the largest contribution is {name}: its standard uncertainty of 
 verdict.remain: the largest contribution is {name}, standard uncertainty {size}; without it the
     expanded uncertainty would still be {rest:m/2}
 verdict.add_other_speed: scan the part again at twice the speed, with X in the other direction
+verdict.add_new_speed: scan the part again at a speed that none of the scans has had
 verdict.add_other_direction: scan the part again with the spindle reversed
 verdict.add_reclocked: turn the part on the chuck by 80°, and scan it again at twice the speed
 verdict.add_repeated_track: scan the part again in the same way
@@ -49,6 +50,8 @@ verdict.add_beyond_centre: scan the part again at twice the speed, with X in the
     beyond the centre by 0.3 of the radius
 verdict.add_other_stand_off: scan the part again at another stand-off of the probe
 verdict.add_reference_artefact: measure a reference artefact
+verdict.dust: {count:count} points left out as dust, up to {largest:m/2} off, may be defects;
+    inspect them, and decide with omsm form
 """)
 
 SOURCE_NAMES = {

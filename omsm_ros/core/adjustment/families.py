@@ -18,8 +18,9 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
 from omsm_ros.errors import ConfigurationError
 
-# Scans that would show a family, codes for the messages.
-OTHER_SPEED, OTHER_DIRECTION, RECLOCKED = "other_speed", "other_direction", "reclocked"
+# Scans that would show a family, codes for the messages; a new speed where there are two already.
+OTHER_SPEED, NEW_SPEED = "other_speed", "new_speed"
+OTHER_DIRECTION, RECLOCKED = "other_direction", "reclocked"
 BEYOND_CENTRE, REPEATED_TRACK = "beyond_centre", "repeated_track"
 OTHER_STAND_OFF, REFERENCE = "other_stand_off", "reference_artefact"
 
@@ -140,47 +141,50 @@ def _one(
 _SAME_SPEED = 0.01
 
 
+def _speed_to_add(r: Ranges) -> str:
+    return NEW_SPEED if np.ptp(np.abs(r.speeds)) > _SAME_SPEED * r.speed else OTHER_SPEED
+
+
 def _dynamic(r: Ranges) -> list[Family]:
     """Lag since the step test and what may change it, latency, asymmetry and backlash."""
     far = max(abs(r.slide[0]), abs(r.slide[1]))
-    middle, fast = sum(r.lift) / 2, r.motion * r.speed
+    middle, fast, speed = sum(r.lift) / 2, r.motion * r.speed, _speed_to_add(r)
     found = [
         # A step test leaves less than 0.1 ms of lag unknown; the default covers its change.
-        _one("lag_change", "s", lambda v: v.motion_rate, 3e-4, OTHER_SPEED, 1e-4),
+        _one("lag_change", "s", lambda v: v.motion_rate, 3e-4, speed, 1e-4),
         _one("probe_latency", "s", lambda v: v.lateral_error(v.x_rate, v.y_rate), 3e-4,
              OTHER_STAND_OFF),
         # Readings that come later than in the step test: by place and by Z, which nearly cancel.
         _one("latency_change", "s", lambda v: v.motion_rate + v.lateral_error(v.x_rate, v.y_rate),
-             3e-4, OTHER_SPEED),
-        _one("lag_asymmetry", "s", lambda v: np.abs(v.motion_rate), 1e-4, OTHER_SPEED),
+             3e-4, speed),
+        _one("lag_asymmetry", "s", lambda v: np.abs(v.motion_rate), 1e-4, speed),
         _one("motion_error", "m", lambda v: v.motion_play, 1e-7, OTHER_DIRECTION),
         _one("lag_motion", "s", lambda v: v.motion_rate * (v.motion - middle) / r.motion, 1e-4,
-             OTHER_SPEED),
-        _one("lag_x", "s", lambda v: v.motion_rate * (v.slide_x / far - 0.5), 1e-4, OTHER_SPEED),
+             speed),
+        _one("lag_x", "s", lambda v: v.motion_rate * (v.slide_x / far - 0.5), 1e-4, speed),
         # From the first scan on, and from the beginning of each.
         Family("lag_time", "s", 2, lambda v: v.motion_rate * np.stack(
-            [v.time / r.duration, v.since / r.durations[v.index]]), 1e-4, OTHER_SPEED),
+            [v.time / r.duration, v.since / r.durations[v.index]]), 1e-4, speed),
         _one("lag_rate", "s", lambda v: v.motion_rate * np.abs(v.motion_rate) / fast, 1e-4,
-             OTHER_SPEED),
+             speed),
         Family("lag_c", "s", 2, lambda v: v.motion_rate * np.stack(_waves(v.c, 1)), 1e-4,
                RECLOCKED),
-        _one("lag_curvature", "s²", lambda v: -v.motion_acceleration, 1e-5, OTHER_SPEED),
-        Family("creep", "1", 2, lambda v: v.motion_fading.T, 1e-3, OTHER_SPEED),
+        _one("lag_curvature", "s²", lambda v: -v.motion_acceleration, 1e-5, speed),
+        Family("creep", "1", 2, lambda v: v.motion_fading.T, 1e-3, speed),
     ]  # fmt: skip
-    speeds = np.abs(r.speeds)
     # With one speed, or one direction, the column is that of the lag itself.
-    if np.ptp(speeds) > _SAME_SPEED * r.speed:
+    if speed == NEW_SPEED:
         found.append(_one("lag_speed", "s", lambda v: v.motion_rate * (abs(v.speed) / r.speed - 1),
-                          5e-5, OTHER_SPEED))  # fmt: skip
+                          5e-5, speed))  # fmt: skip
         found += [
             _one("part_bow_speed", "m", lambda v: (v.x**2 + v.y**2) * (v.speed / r.speed / r.radius)
-                 ** 2, 1e-7, OTHER_SPEED),
+                 ** 2, 1e-7, speed),
             Family("unbalance", "m", 2, lambda v: (v.speed / r.speed) ** 2 * np.stack(
-                _waves(v.c, 1)), 1e-7, OTHER_SPEED),
+                _waves(v.c, 1)), 1e-7, speed),
         ]  # fmt: skip
     if min(r.speeds) < 0 < max(r.speeds):
         found.append(_one("lag_direction", "s", lambda v: v.motion_rate * np.sign(v.speed), 5e-5,
-                          OTHER_SPEED))  # fmt: skip
+                          speed))  # fmt: skip
     return found
 
 
@@ -281,7 +285,7 @@ def _of_the_probe(r: Ranges) -> list[Family]:
         _one("probe_slope_fourth", "m", lambda v: (v.slope_x**2 + v.slope_y**2) ** 2, 1e-5,
              REFERENCE),
         _one("probe_slope_moving", "m", lambda v: np.hypot(v.slope_x, v.slope_y)
-             * np.abs(v.motion_rate) / fast, 1e-7, OTHER_SPEED),
+             * np.abs(v.motion_rate) / fast, 1e-7, _speed_to_add(r)),
         _one("static_gain", "1", lambda v: -v.distance, 1e-2, OTHER_STAND_OFF),
         _one("probe_square", "m", lambda v: (v.distance / end) ** 2,
              1e-7 * (end / r.distance) ** 2, OTHER_STAND_OFF),

@@ -13,6 +13,7 @@ import numpy as np
 from omsm_ros.core.adjustment.blocks import blocks_of
 from omsm_ros.core.adjustment.families import (
     BEYOND_CENTRE,
+    NEW_SPEED,
     OTHER_DIRECTION,
     OTHER_SPEED,
     RECLOCKED,
@@ -50,6 +51,8 @@ _NOISE_M, _WALK_M, _CELLS_M, _BAND_M = 12e-9, 1e-9, 1e-9, 5e-9
 _FORMS, _FORM_M, _SHARE = 40, 30e-9, 0.9
 # Between two scans: the spindle is stopped, turned over, and the probe driven back.
 _PAUSE_S = 20.0
+# A speed like this is no other one; a third one lies between the first and twice the first.
+_SAME_SPEED, _BETWEEN = 0.1, 0.75
 # A third turn of the part would leave its third harmonics where they were.
 _RECLOCKED_RAD = np.deg2rad(80.0)
 _RANGE_M = 1e-5
@@ -292,9 +295,13 @@ def best_addition(
 ) -> tuple[str, float]:
     """Return the code of the scan to add that helps most, and U (k = 2) of PV with it [m]."""
     designs = [design_of(scan) for scan in scans]
+    added = additions(designs[0])
+    del added[REPEATED_TRACK]  # leaves the set without redundancy
+    other = added[OTHER_SPEED].rpm
+    if any(abs(abs(d.rpm) - abs(other)) < _SAME_SPEED * abs(other) for d in designs):
+        added[NEW_SPEED] = replace(added.pop(OTHER_SPEED), rpm=_BETWEEN * other)
     reached = {
-        code: 2 * posterior_uncertainty([*designs, added], priors, nominal, removed, found).pv
-        for code, added in additions(designs[0]).items()
-        if code != REPEATED_TRACK  # leaves the set without redundancy
+        code: 2 * posterior_uncertainty([*designs, one], priors, nominal, removed, found).pv
+        for code, one in added.items()
     }
     return min(reached.items(), key=lambda item: item[1])

@@ -84,6 +84,13 @@ def test_a_repeated_track_does_not_show_a_lag():
     assert max(faster.sources["lag_change"][0], reversed_.sources["lag_change"][0]) < 1e-6
 
 
+def test_a_third_scan_has_a_third_speed_or_another_purpose():
+    machine = Machine(1, pitch=1.6e-3)
+    scans = [machine.scan(30), machine.scan(60, outward=True)]
+    codes = [best_addition(scans[:n], PRIORS, MIRROR, POSE)[0] for n in (1, 2)]
+    assert codes[1] != "other_speed"
+
+
 def test_beyond_the_centre_straightness_is_separated_from_the_part():
     """Odd parts of a bend look like no part that is scanned from both sides."""
     bent = [p for p in PRIORS if p.name != "squareness"]
