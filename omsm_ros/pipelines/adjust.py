@@ -39,7 +39,7 @@ from omsm_ros.core.kinematics.kinematics import Surface, workpiece_xy
 from omsm_ros.core.streams.blocks import Account
 from omsm_ros.core.surface.aperture import within_aperture
 from omsm_ros.core.surface.deviation import mismatch
-from omsm_ros.errors import BagError, ConfigurationError
+from omsm_ros.errors import BagError, ConfigurationError, Notice
 from omsm_ros.io.files import REPORT, save_json, save_text
 from omsm_ros.io.results import PlyWriter
 from omsm_ros.io.topics import AnyBag
@@ -275,11 +275,11 @@ def adjustment_facts(
 
     tolerance: of the peak to valley [m], None: conformity is not assessed
     """
-    doubts = dict.fromkeys(doubt for scan in scans for doubt in scan.doubts)
+    recorded = dict.fromkeys(doubt for scan in scans for doubt in scan.doubts)
     facts: dict[str, Any] = {
         "schema": SCHEMA,
         "calibration": calibration.id,
-        "verdict": verdict_entry(found.verdict, len(scans), doubts),
+        "verdict": verdict_entry(found.verdict, len(scans), recorded),
         "figures": figures_entry(found.form),
         "scans": [
             {
@@ -303,8 +303,18 @@ def adjustment_facts(
         "drift_walk": found.drift_walk,
     }
     if tolerance is not None:
-        facts["conformity"] = conformity_entry(facts["figures"], tolerance)
+        doubts = _of_dust(found.form)
+        facts["conformity"] = conformity_entry(facts["figures"], tolerance, doubts)
     return facts
+
+
+def _of_dust(form: FormMap) -> list[dict[str, Any]]:
+    """Return what the figures do not contain: points that were left out, if they are defects."""
+    if not len(form.dust):
+        return []
+    largest, height = np.max(np.abs(form.dust)), np.ptp(np.append(form.height, form.dust))
+    reason = Notice("verdict.dust", count=len(form.dust), largest=float(largest))
+    return [{"reason": reason, "peak_to_valley": float(height)}]
 
 
 def conformity_entry(
@@ -330,6 +340,10 @@ def figures_entry(form: FormMap) -> dict[str, Any]:
         "peak_to_valley": figure(form.pv.value, form.pv.uncertainty),
         "rms": figure(form.rms.value, form.rms.uncertainty),
         "removed": list(form.removed),
+        "left_out": {
+            "points": len(form.dust),
+            "largest": float(np.max(np.abs(form.dust), initial=0.0)),
+        },
         "terms": [
             {"n": t.n, "m": t.m, **figure(value, size)}
             for t, value, size in zip(form.terms, form.coefficients, spread, strict=True)

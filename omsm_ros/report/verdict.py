@@ -115,6 +115,9 @@ def headline(facts: Mapping[str, Any]) -> str:
     text = (
         f"PV {expanded(pv['value'], pv['standard_uncertainty'], 'm')}{covered(facts.get('form'))}"
     )
+    if (left_out := facts["figures"].get("left_out") or {}).get("points"):
+        text += f" without {count(left_out['points'])} points"
+        text += f" left out as dust, up to {quantity(left_out['largest'], 'm', 2)} off"
     if (judged := facts.get("conformity")) is not None:
         open_ = _INCOMPLETE if judged.get("reasons") else _OPEN
         text += f", {_CONFORMITY.get(judged['verdict'], open_)}"

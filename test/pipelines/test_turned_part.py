@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from omsm_ros.cli import main
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.surface.aperture import Aperture, BoundedSurface
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.io.results import CloudFile
 from omsm_ros.pipelines.adjust import adjust_bags, write_adjustment
+from omsm_ros.report.verdict import headline
 
 from .test_corrected_scan import write
 
@@ -23,17 +27,20 @@ def on_chuck(blocks, angle):
     return [(replace(axes, c=axes.c - angle), distance) for axes, distance in blocks]
 
 
-@pytest.fixture(scope="module")
-def adjusted_to(tmp_path_factory, small_scan_blocks, true_calibration):
-    folder = tmp_path_factory.mktemp("turned")
+def written_to(folder, blocks):
+    """Return two bags of ``blocks``, the part turned on the chuck for the second."""
     bags = []
     for k, angle in enumerate((0.0, TURNED_RAD)):
         # The same scan twice would verify itself: another nanometre of distance.
-        blocks = [
-            (axes, replace(distance, distance=distance.distance + 1e-9 * k))
-            for axes, distance in small_scan_blocks
-        ]
-        bags.append(write(folder / f"{k}.mcap", on_chuck(blocks, angle)))
+        again = [(axes, replace(d, distance=d.distance + 1e-9 * k)) for axes, d in blocks]
+        bags.append(write(folder / f"{k}.mcap", on_chuck(again, angle)))
+    return bags
+
+
+@pytest.fixture(scope="module")
+def adjusted_to(tmp_path_factory, small_scan_blocks, true_calibration):
+    folder = tmp_path_factory.mktemp("turned")
+    bags = written_to(folder, small_scan_blocks)
 
     def adjusted_to(nominal):
         return adjust_bags(
@@ -75,3 +82,43 @@ def test_figures_are_of_the_aperture_of_the_nominal_surface(adjusted_to):
     assert np.all(inside | (found.form.area == 0))
     assert np.ptp(found.form.x) > 1.2 * radius
     assert np.max(np.hypot(scans[1].points.x, scans[1].points.y)) > 0.98 * radius
+
+
+def dusty(blocks):
+    """Return ``blocks`` with 300 to 500 nm of dust under a point of a tenth of them."""
+    random = np.random.default_rng(4)
+    chosen, made = random.choice(len(blocks), len(blocks) // 10, replace=False), []
+    for number, (axes, distance) in enumerate(blocks):
+        away = distance.distance.copy()
+        if number in chosen:
+            away[random.integers(len(away))] += random.uniform(300e-9, 500e-9)
+        made.append((axes, replace(distance, distance=away)))
+    return made
+
+
+def test_dust_is_counted_and_is_no_culprit(tmp_path, capsys, small_scan_blocks, true_calibration):
+    """By command: PV, and what is refuted, as without it; conformity is open, it may be defects."""
+    save_calibration(tmp_path / "cal.json", true_calibration)
+    mirror = "{shape: off_axis_paraboloid, parent_focal_length: 0.0254, off_axis_distance: 0.0508}"
+    (tmp_path / "mirror.yaml").write_text(mirror)
+    seen = {}
+    for name, blocks in (("clean", small_scan_blocks), ("dusty", dusty(small_scan_blocks))):
+        (tmp_path / name).mkdir()
+        bags = written_to(tmp_path / name, blocks)
+        main(["adjust", *map(str, bags), "--calibration", str(tmp_path / "cal.json"),
+              "--nominal", str(tmp_path / "mirror.yaml"), "--clocking", "0", str(TURNED_RAD),
+              "--tolerance", "300e-9", "--json", "--no-report",
+              "--out", str(tmp_path / name)])  # fmt: skip
+        seen[name] = json.loads(capsys.readouterr().out)
+    clean, found = seen["clean"], seen["dusty"]
+    assert clean["figures"]["left_out"] == {"points": 0, "largest": 0.0}
+    left_out = found["figures"]["left_out"]
+    dust = 2 * len(small_scan_blocks) // 10
+    assert 0.95 * dust <= left_out["points"] <= dust
+    assert 480e-9 < left_out["largest"] < 540e-9
+    assert f"without {left_out['points']} points left out as dust" in headline(found)
+    pv = [facts["figures"]["peak_to_valley"] for facts in (clean, found)]
+    assert abs(pv[0]["value"] - pv[1]["value"]) < 2 * pv[0]["standard_uncertainty"]
+    refuted = [[s["name"] for s in f["sources"] if s["refuted"]] for f in (clean, found)]
+    assert refuted[0] == refuted[1]
+    assert "dust" in found["conformity"]["reasons"][0]

@@ -7,8 +7,8 @@ from functools import partial
 import numpy as np
 
 from omsm_ros.core.adjustment.agreement import ScanAgreement, agreement_of
-from omsm_ros.core.adjustment.blocks import block_columns, blocks_of
-from omsm_ros.core.adjustment.disturbances import follows_removed, lines_of, steps_of
+from omsm_ros.core.adjustment.blocks import block_columns, blocks_of, node_means
+from omsm_ros.core.adjustment.disturbances import dust_of, follows_removed, lines_of, steps_of
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.families import families_of, ranges_of
 from omsm_ros.core.adjustment.figures import (
@@ -21,7 +21,7 @@ from omsm_ros.core.adjustment.figures import (
     form_map,
     largest_contribution,
 )
-from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve, walk_deviate
+from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve
 from omsm_ros.core.adjustment.part_terms import part_model
 from omsm_ros.core.adjustment.planning import best_addition
 from omsm_ros.core.adjustment.refutation import (
@@ -32,6 +32,7 @@ from omsm_ros.core.adjustment.refutation import (
     fit_and_refute,
     settled,
     start_scales,
+    walk_deviate,
 )
 from omsm_ros.core.adjustment.scan_data import (
     ScanData,
@@ -63,7 +64,7 @@ from omsm_ros.errors import DataError
 # Enough for lines and steps to stand out; they are tested after the scales have settled.
 _FIRST_STEPS = 2
 # A backlash is found from the one that was assumed; 5 % of it are 5 % of the shape at a reversal.
-_PLAY_STEPS, _SAME_PLAY = 3, 0.05
+_PLAY, _PLAY_STEPS, _SAME_PLAY = "motion_error", 3, 0.05
 # Points at a time of corrected heights.
 _CHUNK = 16_384
 
@@ -178,24 +179,21 @@ def adjust(
     ConfigurationError
         For a declared source that is no family of the adjustment.
     """
-    if not scans:
-        raise DataError("no scan to adjust; give one or more scans of one part")
-    for number, scan in enumerate(scans, 1):
-        if not scan.is_spiral:
-            width = float(np.ptp(np.hypot(scan.x, scan.y)))
-            raise DataError("adjustment.no_spiral", scan=number, turns=scan.turns, width=width)
+    _check_spirals(scans)
     surface: Surface = fitted_surface(scans[0]) if nominal is None else nominal
     if calibration is not None:
         priors = with_dynamics(priors, calibration)
     zero = zero_of(scans, surface)
     views = [view_of(s, k, zero, surface) for k, s in enumerate(scans)]
-    detecting, refutations, doubts = _with_its_play(scans, views, priors)
+    views, dust, first = _without_dust(scans, views, priors)
+    detecting, refutations, doubts = _with_its_play(first, views, priors)
     solution, families = completed(detecting, refutations), detecting.network.families
     made = FormOf.of(solution, surface, removed)
     effects = effects_on_form(made)
     form = form_map(made, doubts, effects)
     # The zero of the heights was taken off before the fit, and belongs to the piston.
-    form = replace(form, pose=form.pose + zero.height * (np.array(removed) == "piston"))
+    piston = zero.height * (np.array(removed) == "piston")
+    form = replace(form, pose=form.pose + piston, dust=dust)
     agreement = agreement_of(solution, surface, removed)
     wrong = _wrong_signs(views)
     enough, stated = redundant(scans), {p.name for p in priors}
@@ -220,20 +218,45 @@ def adjust(
     )  # fmt: skip
 
 
+def _check_spirals(scans: Sequence[ScanData]) -> None:
+    if not scans:
+        raise DataError("no scan to adjust; give one or more scans of one part")
+    for number, scan in enumerate(scans, 1):
+        if not scan.is_spiral:
+            width = float(np.ptp(np.hypot(scan.x, scan.y)))
+            raise DataError("adjustment.no_spiral", scan=number, turns=scan.turns, width=width)
+
+
+def _without_dust(
+    scans: Sequence[ScanData], views: list[ScanView], priors: Sequence[Source]
+) -> tuple[list[ScanView], FloatArray, Solution]:
+    """Return ``views`` without dust, how far it is off (d,) [m], and a first solution."""
+    first = _started(_network(scans, views, priors), priors)
+    dust = [dust_of(first, view) for view in views]
+    away = np.concatenate([heights for _, heights in dust])
+    if len(away):
+        views = [v.part(np.setdiff1d(np.arange(len(v)), points))
+                 for v, (points, _) in zip(views, dust, strict=True)]  # fmt: skip
+        first = _started(_network(scans, views, priors), priors)
+    return views, away, first
+
+
 def _with_its_play(
-    scans: Sequence[ScanData], views: Sequence[ScanView], priors: Sequence[Source]
+    first: Solution, views: Sequence[ScanView], priors: Sequence[Source]
 ) -> tuple[Solution, tuple[Refutation, ...], tuple[Doubt, ...]]:
     """Return the solution with a backlash as wide as it is found, where the scans refute any.
 
     If they do not refute it more surely by that, it is an error of the direction without a width.
     """
-    found, assumed = _fitted(*_network(scans, views, priors), views, priors), 0.0
+    found, assumed, network = _fitted(first, views, priors), 0.0, first.network
+    families = [f for f in network.families if f.name == _PLAY]
     for _ in range(_PLAY_STEPS):
         half = _play_of(found[0], assumed)
         if not found[1] or half == assumed:
             break
         assumed, views = half, [replace(v, motion_play=play(v.motion, half)) for v in views]
-        larger = _fitted(*_network(scans, views, priors), views, priors)
+        column = np.concatenate([node_means(v, families) for v in views])
+        larger = _fitted(_started(network.with_column(_PLAY, column), priors), views, priors)
         if _of_play(larger[1]) < _of_play(found[1]):
             break
         found = larger
@@ -242,12 +265,12 @@ def _with_its_play(
 
 def _of_play(refutations: Sequence[Refutation]) -> float:
     """Return the gain of the backlash among what was refuted."""
-    return sum(r.evidence.gain for r in refutations if r.name == "motion_error")
+    return sum(r.evidence.gain for r in refutations if r.name == _PLAY)
 
 
 def _play_of(solution: Solution, assumed: float) -> float:
     """Return half the backlash that is found [m]; ``assumed`` if it is not another one."""
-    family = next(f for f in solution.network.families if f.name == "motion_error")
+    family = next(f for f in solution.network.families if f.name == _PLAY)
     evidence = evidence_of(solution, family)
     half, unsure = abs(float(evidence.values[0])), 3 * float(evidence.uncertainty[0])
     another = abs(half - assumed) > max(unsure, _SAME_PLAY * half) and half > unsure
@@ -268,28 +291,32 @@ def _walk(solution: Solution, priors: Sequence[Source]) -> tuple[float, float]:
 
 def _network(
     scans: Sequence[ScanData], views: Sequence[ScanView], priors: Sequence[Source]
-) -> tuple[Network, dict[str, float]]:
+) -> Network:
     families = families_of(ranges_of(views, priors, [s.clamping for s in scans]), priors)
     blocks = blocks_of(views, [s.weight for s in scans], families)
-    part = part_model(blocks, min(s.turns for s in scans))
-    return Network(blocks, families, part), prior_sizes(families, priors)
+    return Network(blocks, families, part_model(blocks, min(s.turns for s in scans)))
+
+
+def _started(network: Network, priors: Sequence[Source]) -> Solution:
+    """Return the solution by declarations and defaults, its scales nearly settled."""
+    walk = {p.name: p.uncertainty for p in priors}.get("drift_walk")
+    sizes, y = prior_sizes(network.families, priors), network.blocks.deviation
+    return settled(solve(network, y, start_scales(network, walk), sizes), _FIRST_STEPS)
 
 
 def _fitted(
-    network: Network, sizes: Mapping[str, float], views: Sequence[ScanView],
-    priors: Sequence[Source],
-) -> tuple[Solution, tuple[Refutation, ...], tuple[Doubt, ...]]:  # fmt: skip
+    first: Solution, views: Sequence[ScanView], priors: Sequence[Source]
+) -> tuple[Solution, tuple[Refutation, ...], tuple[Doubt, ...]]:
     """Return the solution, lines and steps of the residuals among its families."""
-    walk = {p.name: p.uncertainty for p in priors}.get("drift_walk")
-    y = network.blocks.deviation
-    first = settled(solve(network, y, start_scales(network, walk), sizes), _FIRST_STEPS)
+    network = first.network
     extra: list[Family] = []
     for view in views:
         extra += lines_of(first, view)
         extra += steps_of(first, view.index)
     if extra:
         network = network.with_families(extra, block_columns(views, extra))
-    return fit_and_refute(network, y, first.scales, {**sizes, **prior_sizes(extra, priors)})
+    sizes = {**first.sizes, **prior_sizes(extra, priors)}
+    return fit_and_refute(network, first.y, first.scales, sizes)
 
 
 def _wrong_signs(views: Sequence[ScanView]) -> tuple[tuple[int, float], ...]:
@@ -312,7 +339,7 @@ def _or_sense_of_c(
     mirrored = [replace(s, y=-s.y, c=-s.c) for s in scans]
     zero = zero_of(mirrored, surface)
     views = [view_of(s, k, zero, surface) for k, s in enumerate(mirrored)]
-    fitted = _fitted(*_network(mirrored, views, priors), views, priors)
+    fitted = _fitted(_started(_network(mirrored, views, priors), priors), views, priors)
     agrees = all(r.minor for r in fitted[1])
     return (Reason(WRONG_SENSE),) if agrees else reasons
 

@@ -112,7 +112,7 @@ def _of_scan(
         "variance": per_reading**2 / (count * weight),
         "deviation": mean(view.deviation),
         "turning": mean(view.lateral_error(-view.y, view.x)),
-        "columns": _columns(view, families, begins, count),
+        "columns": node_means(view, families),
         "noise": np.array([per_reading]),
     }
 
@@ -137,16 +137,16 @@ def block_begins(view: ScanView) -> IntArray:
     return np.flatnonzero(np.diff(sector, prepend=sector[0] - 1))
 
 
-def _columns(
-    view: ScanView, families: Sequence[Family], begins: IntArray, count: FloatArray
-) -> FloatArray:
-    """Return the means of all columns over the blocks, (b, p), a chunk of blocks at a time.
+def node_means(view: ScanView, families: Sequence[Family]) -> FloatArray:
+    """Return the means of all columns over a few points of each block, (b, p).
 
-    count: points of each
+    They are made a chunk of blocks at a time.
     """
+    begins = block_begins(view)
+    count = np.diff(begins, append=len(view))
     share = (np.arange(_NODES // 2) + 0.5) / _NODES
     before = (count[:, np.newaxis] * share).astype(np.int64)
-    after = count[:, np.newaxis].astype(np.int64) - 1 - before
+    after = count[:, np.newaxis] - 1 - before
     nodes = begins[:, np.newaxis] + np.concatenate([before, after], axis=1)
     if np.all(count == 1):  # of a plan
         nodes = nodes[:, :1]

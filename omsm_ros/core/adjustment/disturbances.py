@@ -12,7 +12,10 @@ from omsm_ros.core.adjustment.families import REPEATED_TRACK, only
 from omsm_ros.core.adjustment.network import Solution
 from omsm_ros.core.adjustment.scan_data import ScanView
 from omsm_ros.core.adjustment.sources import VIBRATION, Columns, Family
-from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.registration.form_model import outlier_limit
+from omsm_ros.core.registration.isolated_points import ISOLATED, FarPoints
+from omsm_ros.core.registration.placement import Placed
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.streams.statistics import spread_about_median
 
 # Over its neighbours a bin of white noise is beyond 30 once in 10 000 scans of 250 000 points.
@@ -32,15 +35,29 @@ _FOLLOWS, _NEAR_WHOLE = 0.95, 0.1
 _HEIGHT_STEP_M, _C_LOST_RAD = 1e-7, 1e-3
 
 
-def lines_of(solution: Solution, view: ScanView) -> list[Family]:
-    """Return waves in time that stand out of the noise of one scan, both phases of each."""
+def _left(solution: Solution, view: ScanView) -> FloatArray:
+    """Return what ``solution`` leaves of the deviation of one scan, (n,) [m]."""
     net = solution.network
     mine = net.blocks.scan == view.index
-    fitted = (
-        net.fitted(solution.values)
-        + net.cells_of(solution.scales, solution.residual())[net.part.cell]
-    )
-    left = view.deviation - np.interp(view.since, net.blocks.since[mine], fitted[mine])
+    cells = net.cells_of(solution.scales, solution.residual)[net.part.cell[mine]]
+    fitted = (solution.y - solution.residual)[mine] + cells
+    return np.asarray(view.deviation - np.interp(view.since, net.blocks.since[mine], fitted))
+
+
+def dust_of(solution: Solution, view: ScanView) -> tuple[IntArray, FloatArray]:
+    """Return which points of one scan are dust, as a registration finds it, and how high [m]."""
+    left = _left(solution, view)
+    far = FarPoints(outlier_limit(left))
+    nothing = np.empty((0, len(left)))
+    points = Placed(view.x, view.y, left, nothing, nothing, nothing)
+    far.add(points, left, np.ones(len(left), np.bool_))
+    dust, _ = far.dust(ISOLATED)
+    return dust, left[dust]
+
+
+def lines_of(solution: Solution, view: ScanView) -> list[Family]:
+    """Return waves in time that stand out of the noise of one scan, both phases of each."""
+    left = _left(solution, view)
     period = float(np.median(np.diff(view.since)))
     series = np.zeros(round(float(view.since[-1]) / period) + 1)
     series[np.round(view.since / period).astype(np.int64)] = left
@@ -132,7 +149,7 @@ def _height_step(solution: Solution, scan: int) -> tuple[float, float]:
     knot = int(np.argmax(size))
     mine = net.blocks.scan == scan
     since = net.blocks.since[mine]
-    left = (solution.residual() + net.of_drift(solution.values))[mine]
+    left = (solution.residual + net.of_drift(solution.values))[mine]
     window = (since > (knot - 1) * width) & (since < (knot + 2) * width)
     return _break(since[window], left[window]), float(size[knot])
 
@@ -150,7 +167,7 @@ def _break(time: FloatArray, values: FloatArray) -> float:
 def _angle_step(solution: Solution, scan: int) -> tuple[float, float]:
     net = solution.network
     mine = net.blocks.scan == scan
-    turn, left = net.blocks.turn[mine], solution.residual()[mine]
+    turn, left = net.blocks.turn[mine], solution.residual[mine]
     column = net.blocks.turning[mine]
     turns = int(turn[-1]) + 1
 

@@ -73,6 +73,13 @@ class Evidence:
 
 def evidence_of(solution: Solution, family: Family) -> Evidence:
     """Return what the scans say of ``family``."""
+    if family.name not in solution.tested:
+        solution.tested[family.name] = _tested(solution, family)
+    found: Evidence = solution.tested[family.name]
+    return found
+
+
+def _tested(solution: Solution, family: Family) -> Evidence:
     here = solution.network.place[family.name]
     declared = family.name in solution.sizes
     if declared:
@@ -88,7 +95,7 @@ def evidence_of(solution: Solution, family: Family) -> Evidence:
         mixed = solution.matrix[here]
         own = mixed[:, here]
         score = solution.right[here] - mixed @ solution.values
-        explained = solution.factor.forward(mixed[:, solution.active].T)
+        explained = solution.explained(here)
         unit = 1 / np.sqrt(np.maximum(np.diag(own), 1e-300))
         known, axes = np.linalg.eigh((own - explained.T @ explained) * np.outer(unit, unit))
         known, least = np.maximum(known, 0.0), _LEAST_LEFT

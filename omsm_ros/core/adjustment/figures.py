@@ -9,7 +9,7 @@ draws of the map.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -59,7 +59,7 @@ class FormMap:
         their covariance [m²]
     removed: names of the pose, with their values ``pose`` [m], [1], [rad]
     alike: families that the form looks like, the likeliest first, with the change of the map that
-        each may have made, k = 1 (n,) [m]
+        each may have made, k = 1 (n,) [m];  dust: how far what is left out is off (d,) [m]
     """
 
     x: FloatArray
@@ -76,6 +76,7 @@ class FormMap:
     removed: tuple[str, ...]
     pose: FloatArray
     alike: tuple[tuple[str, FloatArray], ...] = ()
+    dust: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def uncertainty(self) -> FloatArray:
@@ -120,9 +121,9 @@ def form_map(
     covariance += open_changes @ open_changes.T
     every, by_height = _term_fit(solution, places)
     alike = tuple(_resembled(made, covariance, every, by_height, effects or {}))
-    more = made.open_changes((), alike)
+    more = np.stack([np.zeros(len(made.height)), *(change for _, change in alike)], axis=1)
     covariance += more @ more.T
-    pv, rms = made.pv_and_rms(made.open_changes(doubts, alike))
+    pv, rms = made.pv_and_rms(np.concatenate([open_changes, more[:, 1:]], axis=1))
     terms, coefficients, term_covariance = _reported(made, doubts)
     shown = by_height[[every.index(t) for t in terms]] @ more
     return FormMap(
@@ -205,7 +206,7 @@ def largest_contribution(
         return None
     errors, parameters = made.errors()
     changes = made.open_changes(doubts, alike)
-    errors = made.with_changes(made.free(errors), changes)
+    errors = made.free(errors) + changes @ _chances(changes.shape[1])
 
     def own(family: Family) -> FloatArray:
         found = effects[family.name].shape / family.wide @ parameters[_part(solution, family)]
@@ -245,8 +246,9 @@ class FormOf:
 
     nominal: for the slopes of ``x``, ``y`` and ``clocking``;  removed: names of the pose
     height: at ``places`` (n,) [m];  pose: values of what was removed
-    rows: change of the map by all parameters (n, p);  share: variance of cells
-    member: cell of each place (n, cells);  columns, fit: of the pose (n, k), (k, n)
+    values: terms of the part there (n, k);  rows: change of the map by all parameters (n, p)
+    share, member: variance of cells, cell of each place (n, cells)
+    columns, fit: of the pose (n, k), (k, n)
     """
 
     solution: Solution
@@ -255,6 +257,7 @@ class FormOf:
     places: Places
     height: FloatArray
     pose: FloatArray
+    values: FloatArray
     rows: FloatArray
     share: FloatArray
     member: scipy.sparse.csr_array
@@ -270,9 +273,8 @@ class FormOf:
         net, scales = solution.network, solution.scales
         places = places or places_of(solution)
         share = net.cell_share(net.weights(scales), scales)
-        found = net.cells_of(scales, solution.residual())
         values = net.part.values(places.x, places.y)
-        height = values @ solution.values[net.terms] + found[places.cell]
+        height = _heights(solution, values, places)
         # The cells follow from the parameters: a − A β.
         rows = net.cell_sums(scales)[places.cell]
         rows *= -share[places.cell, np.newaxis]
@@ -284,21 +286,16 @@ class FormOf:
         )
         return cls(
             solution, nominal, tuple(removed), places, height - columns @ (fit @ height),
-            fit @ height, rows, share, member, columns, fit,
+            fit @ height, values, rows, share, member, columns, fit,
         )  # fmt: skip
-
-    def at(self, places: Places, solution: Solution | None = None) -> FormOf:
-        """Return the form at other ``places``, or as another ``solution`` found it."""
-        return FormOf.of(solution or self.solution, self.nominal, self.removed, places)
 
     def pv_and_rms(self, open_changes: FloatArray | None = None) -> tuple[Figure, Figure]:
         """Return PV and rms with their uncertainty by draws.
 
         open_changes: further changes of the map (n, k), each as likely as a normal deviate [m]
         """
-        draws = self.free(self.errors()[0])
-        if open_changes is not None:
-            draws = self.with_changes(draws, open_changes)
+        changes = np.zeros((len(self.height), 1)) if open_changes is None else open_changes
+        draws = self.free(self.errors()[0]) + changes @ _chances(changes.shape[1])
         rms = figure(self.height, draws, lambda h: np.sqrt(self.places.area @ h**2))
         return figure(self.height, draws, pv_of), rms
 
@@ -309,13 +306,11 @@ class FormOf:
         of ``alike``, (n, k + 1) [m]."""
         found = [np.zeros(len(self.height))]
         for doubt in doubts:
-            before, after = (self.at(self.places, s) for s in (doubt.before, doubt.after))
-            found.append(doubt.share * (after.height - before.height))
+            before, after = (
+                _heights(s, self.values, self.places) for s in (doubt.before, doubt.after)
+            )
+            found.append(doubt.share * self.free(after - before))
         return np.stack([*found, *(change for _, change in alike)], axis=1)
-
-    def with_changes(self, draws: FloatArray, changes: FloatArray) -> FloatArray:
-        """Return ``draws`` (n, draws) with ``changes`` (n, k), each a normal deviate of its own."""
-        return draws + changes @ _chances(changes.shape[1])
 
     def free(self, heights: FloatArray) -> FloatArray:
         """Return ``heights`` (n, …) without their pose."""
@@ -333,6 +328,13 @@ class FormOf:
         )
         errors = self.rows[:, solution.active] @ moved + self.member @ of_cells
         return np.asarray(errors), np.asarray(moved)
+
+
+def _heights(solution: Solution, values: FloatArray, places: Places) -> FloatArray:
+    """Return the form by ``solution`` at ``places``, terms (n, k) and cells, (n,) [m]."""
+    net = solution.network
+    cells = net.cells_of(solution.scales, solution.residual)
+    return np.asarray(values @ solution.values[net.terms] + cells[places.cell])
 
 
 def _chances(number: int) -> FloatArray:
@@ -452,7 +454,7 @@ def _reported(
 ) -> tuple[tuple[ZernikeIndex, ...], FloatArray, FloatArray]:
     """Return the reported terms, their coefficients [m] and covariance [m²]."""
     solution = form.solution
-    made = form.at(nodes_of(solution))
+    made = FormOf.of(solution, form.nominal, form.removed, nodes_of(solution))
     every, fit = _term_fit(solution, made.places)
     kept = [k for k, t in enumerate(every) if 2 <= t.n <= REPORTED_DEGREE]
     fit = fit[kept]

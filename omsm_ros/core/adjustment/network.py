@@ -9,8 +9,10 @@ The normal equations without y are the geometry alone: planning uses them too.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy import linalg, sparse
@@ -107,7 +109,7 @@ class Network:
     def cell_share(self, weights: FloatArray, scales: Scales) -> FloatArray:
         """Return the variance of each cell after its blocks, 1 / (Σw + 1/s²) [m²]."""
         total = self._member @ weights
-        return np.asarray(1 / (total + 1 / max(scales.cells, _LEAST_VARIANCE)))
+        return np.asarray(1 / (total + 1 / max(scales.cells, LEAST_VARIANCE)))
 
     def alone(self, scan: int) -> Network:
         """Return the part by the blocks of ``scan``, without families; sums are not made anew."""
@@ -124,6 +126,13 @@ class Network:
         every = np.concatenate([self.blocks.columns, columns], axis=1)
         blocks, families = replace(self.blocks, columns=every), (*self.families, *extra)
         return Network(blocks, families, self.part, _values=self._values)
+
+    def with_column(self, name: str, values: FloatArray) -> Network:
+        """Return the network with other block means ``values`` (b,) of family ``name``."""
+        columns = self.blocks.columns.copy()
+        columns[:, self.place[name]] = values
+        blocks = replace(self.blocks, columns=columns)
+        return Network(blocks, self.families, self.part, _values=self._values)
 
     def _own(self, scan: int) -> list[tuple[slice, slice]]:
         """Return the parameters that blocks of ``scan`` depend on, which are all but others' knots,
@@ -145,16 +154,23 @@ class Network:
         knots, split = self.knots[scan], self.terms.stop
         size = split + knots.stop - knots.start
         matrix, sums = np.zeros((size, size)), np.zeros((self.part.cells, size))
-        columns = slice(knots.start - split, knots.stop - split)
+        root = 1 / np.sqrt(self.blocks.variance[mine])
+        number = np.arange(len(mine))
+        member = sparse.csc_array((root, (self.part.cell[mine], number)), (len(sums), len(mine)))
+        # Two hats of a block are not zero: their products are sparse.
+        hats = self._hats[mine, knots.start - split : knots.stop - split]
+        hats = sparse.diags_array(root) @ hats
+        matrix[split:, split:] = (hats.T @ hats).toarray()
+        sums[:, split:] = (member @ hats).toarray()
         for first in range(0, len(mine), _PORTION):
-            part = mine[first : first + _PORTION]
-            rows = np.empty((len(part), size))
-            rows[:, : self.terms.start] = self.blocks.columns[part]
-            rows[:, self.terms] = self._values[part]
-            rows[:, split:] = self._hats[part][:, columns].toarray()
-            weighted = rows / self.blocks.variance[part, np.newaxis]
-            sums += self._member[:, part] @ weighted
-            matrix += rows.T @ weighted
+            here = slice(first, first + _PORTION)
+            part = mine[here]
+            rows = np.concatenate([self.blocks.columns[part], self._values[part]], axis=1)
+            rows *= root[here, np.newaxis]
+            matrix[:split, :split] += rows.T @ rows
+            matrix[split:, :split] += hats[here].T @ rows
+            sums[:, :split] += member[:, here] @ rows
+        matrix[:split, split:] = matrix[split:, :split].T
         return matrix, sums
 
     def cell_sums(self, scales: Scales) -> FloatArray:
@@ -214,8 +230,11 @@ class Network:
     def effect(self, name: str, values: FloatArray, covariance: FloatArray) -> tuple[float, float]:
         """Return what ``values`` (size,) of family ``name`` do to the heights, rms over the points,
         and its standard uncertainty by ``covariance`` (size, size) [m]."""
-        columns = self.blocks.columns[:, self.place[name]]
-        power = (columns * self.blocks.count[:, np.newaxis]).T @ columns / self.blocks.count.sum()
+        here, blocks = self.place[name], self.blocks
+        # The inverse variance of a block is its number of points over the variance of one.
+        power = np.add.reduce([noise**2 * matrix[here, here] for noise, (matrix, _)
+                               in zip(blocks.noise, self._by_scan(), strict=True)])  # fmt: skip
+        power /= blocks.count.sum()
         square = np.array([values @ power @ values, np.sum(power * covariance)])
         effect, uncertainty = np.sqrt(np.maximum(square, 0.0))
         return float(effect), float(uncertainty)
@@ -244,14 +263,14 @@ class Network:
         variance = np.array(
             [f**2 if f else scales.bands[int(d)] for f, d in zip(free, degrees, strict=True)]
         )
-        diagonal[self.terms] = 1 / np.maximum(variance, _LEAST_VARIANCE)
+        diagonal[self.terms] = 1 / np.maximum(variance, LEAST_VARIANCE)
         matrix[np.diag_indices(len(active))] += diagonal[active]
         left_out = self.size - len(active)
         for knots, step in zip(self.knots, self.steps, strict=True):
             # Knots stand behind all others, and always take part.
             here = slice(knots.start - left_out, knots.stop - left_out)
             matrix[here, here] += walk_precision(knots.stop - knots.start) / (
-                max(scales.walk, _LEAST_VARIANCE) * step
+                max(scales.walk, LEAST_VARIANCE) * step
             )
             level = _FIRST_LEVEL_M if knots is self.knots[0] else _LEVEL_M
             matrix[here.start, here.start] += level**-2
@@ -267,7 +286,7 @@ def _terms_at(part: PartModel, blocks: Blocks) -> FloatArray:
 
 
 # Square of a picometre: keeps what is exactly known regular.
-_LEAST_VARIANCE, _LEAST_SIZE = 1e-24, 1e-15
+LEAST_VARIANCE, _LEAST_SIZE = 1e-24, 1e-15
 
 
 def walk_precision(number: int) -> FloatArray:
@@ -346,7 +365,7 @@ class Solution:
     matrix, right: normal equations of all, without priors
     sizes: prior standard deviations of the families that took part, of one or of each column
     active: parameters that take part (a,);  factor: of their normal matrix, priors included
-    covariance: of those, (a, a)
+    covariance: of those, (a, a);  tested: what was found of families, by their names
     """
 
     network: Network
@@ -359,10 +378,23 @@ class Solution:
     right: FloatArray
     active: IntArray
     factor: Factor
+    tested: dict[str, Any] = field(default_factory=dict)
 
+    @cached_property
     def residual(self) -> FloatArray:
         """Return y less families, part terms and drift, cells still in it, (b,) [m]."""
         return np.asarray(self.y - self.network.fitted(self.values))
+
+    @cached_property
+    def _explained(self) -> tuple[IntArray, FloatArray]:
+        others = np.setdiff1d(np.arange(self.network.size), self.active)
+        return others, self.factor.forward(self.matrix[np.ix_(self.active, others)])
+
+    def explained(self, here: slice) -> FloatArray:
+        """Return Z (a, k), by whose products those that take part explain ``here`` that do not."""
+        others, spread = self._explained
+        first = int(np.searchsorted(others, here.start))
+        return spread[:, first : first + here.stop - here.start]
 
     def smooth_form(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the form by its terms at x, y [m], cells left out, (n,) [m]."""
@@ -398,89 +430,3 @@ def solve(
     return Solution(
         network, y, scales, sizes, values, factor.inverse(), matrix, right, active, factor
     )
-
-
-def estimate_scales(solution: Solution) -> Scales:
-    """Return one step of the variance components (MacKay, Neural Comp. 4, 415).
-
-    Each variance is the sum of squares of its parameters over how many of them the data determine.
-    """
-    net, scales = solution.network, solution.scales
-    diagonal = np.diag(solution.covariance_of(net.terms))
-    terms, degrees = solution.values[net.terms], net.part.degrees
-    least = _VANISHED * float(np.min(net.blocks.variance))
-    bands = {}
-    for degree, before in scales.bands.items():
-        mine = degrees == degree
-        determined = np.sum(1 - diagonal[mine] / before)
-        bands[degree] = _variance(float(np.sum(terms[mine] ** 2)), float(determined), before, least)
-    residual = solution.residual()
-    cells = net.cells_of(scales, residual)
-    share = net.cell_share(net.weights(scales), scales)
-    seen = np.unique(net.part.cell)
-    determined_cells = float(np.sum(1 - share[seen] / max(scales.cells, _LEAST_VARIANCE)))
-    walked = [(scales.walk * np.sum(moves**2), np.sum(1 - np.diag(covariance)))
-              for moves, covariance in _moves(solution)]  # fmt: skip
-    square, number = (float(total) for total in np.sum(walked, axis=0))
-    return replace(
-        scales,
-        walk=_variance(square, number, scales.walk, least),
-        bands=bands,
-        cells=_variance(float(np.sum(cells**2)), determined_cells, scales.cells, least),
-        noise=_noise(solution, residual - cells[net.part.cell], determined_cells),
-    )
-
-
-# Share of a move's variance that the scans determine; less is rounding.
-_LEAST_KNOWN = 1e-6
-# A step of a variance; what has vanished, as a share of the variance of a block, may come back.
-_LARGEST_STEP, _VANISHED = 30.0, 1e-5
-
-
-def _variance(square: float, determined: float, before: float, least: float) -> float:
-    found = square / max(determined, 1e-3)
-    return float(max(np.clip(found, before / _LARGEST_STEP, before * _LARGEST_STEP), least))
-
-
-def _moves(solution: Solution) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield the moves of the drift of each scan from knot to knot, over their prior standard
-    deviation, with their covariance."""
-    for here, step in zip(solution.network.knots, solution.network.steps, strict=True):
-        moves, size = np.diff(solution.values[here]), solution.scales.walk * step
-        one = np.diff(solution.covariance_of(here), axis=0)
-        yield moves / np.sqrt(size), np.diff(one, axis=1) / size
-
-
-def walk_deviate(solution: Solution, declared: float) -> float:
-    """Return how far the walk lies beyond ``declared`` [m/√s], in standard deviations.
-
-    It is the root of twice the logarithm of the ratio of likelihoods: moves that the scans hardly
-    determine say little, and few moves scatter more above their variance than below it.
-    """
-    gain, ratio = 0.0, max(declared**2 / solution.scales.walk, _LEAST_KNOWN)
-    for moves, covariance in _moves(solution):
-        share, axes = np.linalg.eigh(covariance)
-        known = np.maximum(1 - share, _LEAST_KNOWN)
-        before = 1 + (ratio - 1) * known
-        moved = (axes.T @ moves) ** 2 / known
-        gain += float(np.sum(moved * (1 / before - 1) + np.log(before)))
-    return float(np.sign(1 - ratio) * np.sqrt(max(gain, 0.0)))
-
-
-def _noise(solution: Solution, residual: FloatArray, determined_cells: float) -> FloatArray:
-    """Return the factors of the variance of blocks by the residuals of each scan."""
-    blocks = solution.network.blocks
-    weights = 1 / blocks.variance
-    own = solution.matrix[np.ix_(solution.active, solution.active)]
-    parameters = float(np.sum(solution.covariance * own))
-    share = (parameters + determined_cells) / len(blocks)
-    made = []
-    for k in range(blocks.scans):
-        mine = blocks.scan == k
-        free = max(np.count_nonzero(mine) * (1 - share), 1.0)
-        made.append(float(np.sum(weights[mine] * residual[mine] ** 2)) / free)
-    return np.maximum(made, _LEAST_NOISE)
-
-
-# A block cannot be better than half of what its white noise says.
-_LEAST_NOISE = 0.5

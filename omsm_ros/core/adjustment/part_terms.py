@@ -9,6 +9,7 @@ to all scans, eliminated cell by cell.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy  # whose parts are loaded when they are used
@@ -178,18 +179,21 @@ class FormTerms:
         columns: change of the terms by its plausible size (k, size);  known: information that the
             scans have of its values (size, size), which are in units of that size, too
         """
-        alone = self._best(np.zeros((len(self.values), 1)))[0]
         share, axes = np.linalg.eigh(known)
         gains, found = [], []
         for size in _SIZES:
             root = axes / np.sqrt(np.maximum(share, 0.0) + size**-2)
             likelihood, spread = self._best(columns @ root)
-            gains.append(2 * (likelihood - alone))
+            gains.append(2 * (likelihood - self._alone))
             pulled = scipy.linalg.solve(spread, self.values, assume_a="pos")
             found.append(root @ (root.T @ (columns.T @ pulled)))
         weights = np.exp((np.array(gains) - max(gains)) / 2)
         gain = max(gains) + 2 * np.log(np.mean(weights))
         return float(gain), np.asarray(weights @ np.array(found) / np.sum(weights))
+
+    @cached_property
+    def _alone(self) -> float:
+        return self._best(np.zeros((len(self.values), 1)))[0]
 
     def _best(self, columns: FloatArray) -> tuple[float, FloatArray]:
         """Return the largest log likelihood with ``columns`` of unit variance, and its spread."""

@@ -4,13 +4,13 @@ The family that explains most is released first; those that explain as much as i
 together with it, are one group whose members these scans do not separate.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from omsm_ros.core.adjustment.evidence import Evidence, evidence_of
-from omsm_ros.core.adjustment.network import Network, Scales, Solution, estimate_scales, solve
+from omsm_ros.core.adjustment.network import LEAST_VARIANCE, Network, Scales, Sizes, Solution, solve
 from omsm_ros.core.adjustment.sources import FREE, base_name
 from omsm_ros.core.streams.blocks import FloatArray
 
@@ -112,8 +112,94 @@ def settled(solution: Solution, steps: int) -> Solution:
     return solution
 
 
+def estimate_scales(solution: Solution) -> Scales:
+    """Return one step of the variance components (MacKay, Neural Comp. 4, 415).
+
+    Each variance is the sum of squares of its parameters over how many of them the data determine.
+    """
+    net, scales = solution.network, solution.scales
+    diagonal = np.diag(solution.covariance_of(net.terms))
+    terms, degrees = solution.values[net.terms], net.part.degrees
+    least = _VANISHED * float(np.min(net.blocks.variance))
+    bands = {}
+    for degree, before in scales.bands.items():
+        mine = degrees == degree
+        determined = np.sum(1 - diagonal[mine] / before)
+        bands[degree] = _variance(float(np.sum(terms[mine] ** 2)), float(determined), before, least)
+    residual = solution.residual
+    cells = net.cells_of(scales, residual)
+    share = net.cell_share(net.weights(scales), scales)
+    seen = np.unique(net.part.cell)
+    determined_cells = float(np.sum(1 - share[seen] / max(scales.cells, LEAST_VARIANCE)))
+    walked = [(scales.walk * np.sum(moves**2), np.sum(1 - np.diag(covariance)))
+              for moves, covariance in _moves(solution)]  # fmt: skip
+    square, number = (float(total) for total in np.sum(walked, axis=0))
+    return replace(
+        scales,
+        walk=_variance(square, number, scales.walk, least),
+        bands=bands,
+        cells=_variance(float(np.sum(cells**2)), determined_cells, scales.cells, least),
+        noise=_noise(solution, residual - cells[net.part.cell], determined_cells),
+    )
+
+
+# Share of a move's variance that the scans determine; less is rounding.
+_LEAST_KNOWN = 1e-6
+# A step of a variance; what has vanished, as a share of the variance of a block, may come back.
+_LARGEST_STEP, _VANISHED = 30.0, 1e-5
+
+
+def _variance(square: float, determined: float, before: float, least: float) -> float:
+    found = square / max(determined, 1e-3)
+    return float(max(np.clip(found, before / _LARGEST_STEP, before * _LARGEST_STEP), least))
+
+
+def _moves(solution: Solution) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield the moves of the drift of each scan from knot to knot, over their prior standard
+    deviation, with their covariance."""
+    for here, step in zip(solution.network.knots, solution.network.steps, strict=True):
+        moves, size = np.diff(solution.values[here]), solution.scales.walk * step
+        one = np.diff(solution.covariance_of(here), axis=0)
+        yield moves / np.sqrt(size), np.diff(one, axis=1) / size
+
+
+def walk_deviate(solution: Solution, declared: float) -> float:
+    """Return how far the walk lies beyond ``declared`` [m/√s], in standard deviations.
+
+    It is the root of twice the logarithm of the ratio of likelihoods: moves that the scans hardly
+    determine say little, and few moves scatter more above their variance than below it.
+    """
+    gain, ratio = 0.0, max(declared**2 / solution.scales.walk, _LEAST_KNOWN)
+    for moves, covariance in _moves(solution):
+        share, axes = np.linalg.eigh(covariance)
+        known = np.maximum(1 - share, _LEAST_KNOWN)
+        before = 1 + (ratio - 1) * known
+        moved = (axes.T @ moves) ** 2 / known
+        gain += float(np.sum(moved * (1 / before - 1) + np.log(before)))
+    return float(np.sign(1 - ratio) * np.sqrt(max(gain, 0.0)))
+
+
+def _noise(solution: Solution, residual: FloatArray, determined_cells: float) -> FloatArray:
+    """Return the factors of the variance of blocks by the residuals of each scan."""
+    blocks = solution.network.blocks
+    weights = 1 / blocks.variance
+    own = solution.matrix[np.ix_(solution.active, solution.active)]
+    parameters = float(np.sum(solution.covariance * own))
+    share = (parameters + determined_cells) / len(blocks)
+    made = []
+    for k in range(blocks.scans):
+        mine = blocks.scan == k
+        free = max(np.count_nonzero(mine) * (1 - share), 1.0)
+        made.append(float(np.sum(weights[mine] * residual[mine] ** 2)) / free)
+    return np.maximum(made, _LEAST_NOISE)
+
+
+# A block cannot be better than half of what its white noise says.
+_LEAST_NOISE = 0.5
+
+
 def fit_and_refute(
-    network: Network, y: FloatArray, scales: Scales, sizes: Mapping[str, float]
+    network: Network, y: FloatArray, scales: Scales, sizes: Sizes
 ) -> tuple[Solution, tuple[Refutation, ...], tuple[Doubt, ...]]:
     """Return the solution with all refuted families released, these families, and open doubts.
 

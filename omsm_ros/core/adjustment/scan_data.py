@@ -270,18 +270,25 @@ def delayed(scan: ScanData, latency: float) -> ScanData:
 def _rate(time: FloatArray, values: FloatArray, order: int = 1) -> FloatArray:
     """Return the derivative of ``order`` by time, run by run between gaps."""
     period = float(np.median(np.diff(time)))
-    made = np.empty(len(values))
-    for run in np.split(np.arange(len(time)), np.flatnonzero(np.diff(time) > 1.5 * period) + 1):
-        half = min(max(round(_HALF_WINDOW_S / period), 3), (len(run) - 1) // 2)
-        if 2 * half + 1 > _POLYNOMIAL:
-            # The rounded weights add up to nearly zero: a large constant would leave a derivative.
-            made[run] = scipy.signal.savgol_filter(
-                values[run] - values[run[0]], 2 * half + 1, _POLYNOMIAL, order, period
-            )
-        else:
-            ends = run[[0, -1]]
-            slope = np.diff(values[ends]) / max(float(np.diff(time[ends])[0]), 1e-12)
-            made[run] = 0.0 if order == 2 else slope
+    first = np.append(0, np.flatnonzero(np.diff(time) > 1.5 * period) + 1)
+    length = np.diff(first, append=len(time))
+    last = first + length - 1
+    halves = np.minimum(max(round(_HALF_WINDOW_S / period), 3), (length - 1) // 2)
+    # The rounded weights add up to nearly zero: a large constant would leave a derivative.
+    values = values - np.repeat(values[first], length)
+    slope = values[last] / np.maximum(time[last] - time[first], 1e-12)
+    made = np.repeat(slope if order == 1 else np.zeros(len(slope)), length)
+    derive = np.linalg.matrix_power(np.diag(np.arange(1.0, _POLYNOMIAL + 1), 1), order)
+    for half in np.unique(halves[2 * halves + 1 > _POLYNOMIAL]):
+        mine, place = halves == half, np.arange(2 * half + 1)
+        powers = np.vander(place / half - 1, _POLYNOMIAL + 1, increasing=True)
+        fit, rates = np.linalg.pinv(powers), powers @ derive / (half * period) ** order
+        inside = np.repeat(mine, length)
+        made[inside] = np.correlate(values, rates[half] @ fit, "same")[inside]
+        # Up to the middle of the first window, and from that of the last one on.
+        for begin, ends in ((first, place[:half]), (last - 2 * half, place[half + 1 :])):
+            at = begin[mine, np.newaxis]
+            made[at + ends] = values[at + place] @ fit.T @ rates[ends].T
     return made
 
 

@@ -337,7 +337,7 @@ class _DynamicsFit:
         """Return the result with the covariance by rings."""
         solution, blocks = self._solution, self._solution.network.blocks
         net, scales = solution.network, solution.scales
-        inverse, left = solution.covariance, solution.residual()
+        inverse, left = solution.covariance, solution.residual
         pulled = net.pulled(scales, left)
         rings = int(np.clip(min(s.turns for s in self._scans), _LEAST_RINGS, _MOST_RINGS))
         ring = _rings(np.hypot(blocks.x, blocks.y), rings)

@@ -26,6 +26,14 @@ from omsm_ros.errors import ConfigurationError, DataError
 FIELDS = ("time", "x", "y", "height", "distance", "motion", "removed", "c")
 
 
+def exact_priors():
+    """Return declarations of a part that does not move between the scans."""
+    exact = [Source(*p, evaluated=True) for p in (("part_shift", 1e-9), ("part_turn", 1e-8))]
+    priors = [p for p in PRIORS if p.name not in ("part_shift", "part_turn")]
+    # Two scans to the centre leave it open.
+    return [*priors, *exact, Source("expansion", 2e-7, evaluated=True)]
+
+
 @pytest.fixture(scope="module")
 def table():
     """One to three scans of the machine of the design: 35 µs of lag that nobody knows."""
@@ -35,10 +43,7 @@ def table():
         machine.scan(60, outward=True),
         machine.scan(30, clocking=np.deg2rad(80)),
     ]
-    exact = [Source(*p, evaluated=True) for p in (("part_shift", 1e-9), ("part_turn", 1e-8))]
-    priors = [p for p in PRIORS if p.name not in ("part_shift", "part_turn")]
-    # Two scans to the centre leave it open.
-    priors += [*exact, Source("expansion", 2e-7, evaluated=True)]
+    priors = exact_priors()
     found = [adjust(scans[:n], priors, nominal=MIRROR, accuracy=25e-9) for n in (1, 2, 3)]
     return machine, scans, found
 
@@ -50,6 +55,28 @@ def test_a_second_speed_takes_away_what_one_scan_cannot(table):
         *_, error = normalised(machine, adjustment)
         assert least < adjustment.form.mean_uncertainty < most
         assert error < 2 * adjustment.form.mean_uncertainty
+
+
+def test_dust_is_left_out(table):
+    """400 nm under sixty points of each scan: figures, sources and verdict as without it."""
+    (_, scans, (_, two, _)), priors = table, exact_priors()
+    random, seen = np.random.default_rng(5), []
+    for scan in scans[:2]:
+        dust = np.zeros(len(scan))
+        dust[random.choice(len(scan), 60, replace=False)] = 400e-9
+        seen.append(replace(scan, height=scan.height + dust, distance=scan.distance + dust))
+    found = adjust(seen, priors, nominal=MIRROR, accuracy=25e-9)
+    assert len(found.form.dust) == 120
+    assert found.verdict.code == VERIFIED
+    assert not found.refutations
+    assert found.form.pv.value == pytest.approx(two.form.pv.value, abs=2e-9)
+
+
+def test_what_three_speeds_show_is_advised_after_two(table):
+    """Twice the speed was scanned already: a lag that depends on it needs yet another one."""
+    _, _, (one, two, _) = table
+    assert one.source("lag_rate").shown_by == "other_speed"
+    assert two.source("lag_speed").shown_by == two.source("lag_rate").shown_by == "new_speed"
 
 
 def test_a_circle_is_no_spiral(table):

@@ -13,11 +13,11 @@ from omsm_ros.core.adjustment.blocks import SECTORS, block_begins
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.families import BEYOND_CENTRE, REFERENCE, families_of, ranges_of
 from omsm_ros.core.adjustment.figures import FormOf, _term_fit, effects_on_form, nodes_of, places_of
-from omsm_ros.core.adjustment.network import Factor, solve, walk_deviate
+from omsm_ros.core.adjustment.network import Factor, solve
 from omsm_ros.core.adjustment.part_terms import part_model
-from omsm_ros.core.adjustment.refutation import completed, probabilities, start_scales
+from omsm_ros.core.adjustment.refutation import completed, probabilities, start_scales, walk_deviate
 from omsm_ros.core.adjustment.scan_data import view_of, zero_of
-from omsm_ros.core.adjustment.sources import Source
+from omsm_ros.core.adjustment.sources import Source, prior_sizes
 from omsm_ros.core.streams.statistics import white_noise
 from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
 
@@ -29,7 +29,8 @@ def small():
     scans = [machine.scan(60), machine.scan(-90, outward=True)]
     zero = zero_of(scans, MIRROR)
     views = [view_of(s, k, zero, MIRROR) for k, s in enumerate(scans)]
-    network, sizes = _network(scans, views, PRIORS)
+    network = _network(scans, views, PRIORS)
+    sizes = prior_sizes(network.families, PRIORS)
     return views, network, sizes
 
 

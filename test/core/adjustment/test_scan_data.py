@@ -12,6 +12,7 @@ from omsm_ros.core.adjustment.agreement import agreement_of
 from omsm_ros.core.adjustment.network import solve
 from omsm_ros.core.adjustment.refutation import start_scales
 from omsm_ros.core.adjustment.scan_data import ScanData, delayed, view_of, zero_of
+from omsm_ros.core.adjustment.sources import prior_sizes
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +29,7 @@ def test_zeros_of_machine_and_probe_are_no_error_of_either(scans):
     ]
     networks = [
         _network(all_, [view_of(s, k, zero_of(all_, MIRROR), MIRROR) for k, s in enumerate(all_)],
-                 PRIORS)[0]
+                 PRIORS)
         for all_ in (scans, far)
     ]  # fmt: skip
     near, moved = (network.blocks for network in networks)
@@ -64,7 +65,8 @@ def test_scans_of_one_form_have_one_rms(scans):
     two = [machine.scan(30), machine.scan(60, outward=True, start=12.25e-3, end=0.45e-3)]
     zero = zero_of(two, MIRROR)
     views = [view_of(s, k, zero, MIRROR) for k, s in enumerate(two)]
-    network, sizes = _network(two, views, PRIORS)
+    network = _network(two, views, PRIORS)
+    sizes = prior_sizes(network.families, PRIORS)
     solution = solve(network, network.blocks.deviation, start_scales(network, 1e-12), sizes)
     pose = ("piston", "tip", "tilt")
     one, other = (a.alone[1].value for a in agreement_of(solution, MIRROR, pose))
