@@ -230,6 +230,8 @@ def _show_form(facts: Facts) -> None:
     if held := facts.get("conformity"):
         verdict = [("tolerance", f"{held['verdict']}, {quantity(held['tolerance'], 'm')}")]
         verdict += [("reason", text) for text in held["reasons"]]
+    else:
+        verdict = [("open", o["reason"]) for o in facts["open"] if o["peak_to_valley"] is not None]
     verdict += _drawing_rows(facts.get("drawing"))
     files = [FORM, CURVES, DEVIATION, *([facts["report"]] if "report" in facts else [])]
     table([*verdict, *form_rows(facts), written(files, facts["out"])])

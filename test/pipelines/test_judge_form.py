@@ -122,6 +122,12 @@ def test_known_terms_are_reported_within_their_uncertainty(folder, held):
     assert figures["rms_before_fit"]["value"] > 5e-6
 
 
+def test_points_left_out_are_stated_without_a_tolerance_too(folder, tmp_path, capsys):
+    """Excluded on request, they are a note; otherwise they may be defects."""
+    assert form(folder, tmp_path, "--fit", "piston,tip,tilt")[0] == 0
+    assert "points left out as dust, up to 5" in capsys.readouterr().out
+
+
 def test_a_move_that_looks_like_form_is_held_and_terms_carry_what_it_may_do(automatic):
     """For an unmoved part the terms are the true ones within their stated uncertainty."""
     found = automatic
