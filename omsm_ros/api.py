@@ -37,10 +37,18 @@ from omsm_ros.interface_results import (
     Recording,
     Spectrum,
 )
+from omsm_ros.quantities import shown
 
 if TYPE_CHECKING:
     from omsm_ros.core.kinematics.kinematics import Surface
     from omsm_ros.core.surface.aperture import Aperture
+
+
+def _checked(value: Any, kind: type) -> Any:
+    """Return ``value``; raise ConfigurationError, with the remedy, if it is no ``kind``."""
+    if isinstance(value, kind):
+        return value
+    raise ConfigurationError(f"{shown(value)} is no {kind.__name__}; use omsm.read or omsm.load")
 
 
 def identify(
@@ -86,7 +94,7 @@ def identify(
 
     if not isinstance(recording, Recording):
         if distance is None or period is None:
-            raise ConfigurationError("arrays need distance and period; or give a Recording")
+            raise ConfigurationError("arrays need distance and period; files need omsm.read(path)")
         recording = Recording(np.asarray(recording), np.asarray(distance), period)
     pairs = list(recording.blocks())
     record = assemble([a for a, _ in pairs], [d for _, d in pairs])
@@ -130,8 +138,8 @@ def correct(
     from omsm_ros.core.correction.surface_points import join_points
 
     options = CorrectionOptions(polarity=polarity, probe_latency=latency, surface=nominal)
-    corrector, parts = Corrector(calibration.core, options), []
-    for axes, distance in recording.blocks():
+    corrector, parts = Corrector(_checked(calibration, Calibration).core, options), []
+    for axes, distance in _checked(recording, Recording).blocks():
         corrector.push_axes(axes)
         corrector.push_distance(distance)
         parts.append(corrector.take())
@@ -176,6 +184,7 @@ def form(
     from omsm_ros.core.form.analyse import analyse_form
     from omsm_ros.core.registration.placement import PointBatch
 
+    points = _checked(points, Points)
     batch = PointBatch(points.x, points.y, points.height, np.zeros((0, len(points))))
     asked = [fit] if isinstance(fit, str) else list(fit)
     found = analyse_form(nominal, lambda: [batch], asked, aperture=aperture)
@@ -238,7 +247,7 @@ def adjust(
                 scan.save(paths[k])
         found, read_scans = adjust_bags(
             paths,
-            calibration.core,
+            _checked(calibration, Calibration).core,
             nominal=nominal,
             stated=load_sources(sources),
             clockings=clocking,
@@ -359,12 +368,7 @@ def plan(
     True
     """
     from omsm_ros.core.adjustment import ScanDesign
-    from omsm_ros.core.kinematics.trajectories import (
-        PLANNED_COUNT,
-        PLANNED_DWELL_S,
-        SECOND_SHARE,
-        plan_steps,
-    )
+    from omsm_ros.core.kinematics import trajectories as motions
     from omsm_ros.io.gcode_file import DIALECTS, steps_gcode
     from omsm_ros.pipelines.plan_scans import scan_path, scan_program
 
@@ -372,9 +376,9 @@ def plan(
         raise ConfigurationError(f"dialect {dialect!r} is none of {', '.join(DIALECTS)}")
     if nominal is None:
         step = steps.get("step", 9.8e-6)
-        usual = {"step": step, "second_step": SECOND_SHARE * step, "count": PLANNED_COUNT,
-                 "dwell": PLANNED_DWELL_S}  # fmt: skip
-        test = plan_steps(sample_period=period, **{**usual, **steps})
+        usual = {"step": step, "second_step": motions.SECOND_SHARE * step,
+                 "count": motions.PLANNED_COUNT, "dwell": motions.PLANNED_DWELL_S}  # fmt: skip
+        test = motions.plan_steps(sample_period=period, **{**usual, **steps})
         z = test.z(np.arange(0.0, test.duration, period, dtype=np.float64))
         zero = np.zeros(len(z))
         return Plan(z=z, x=zero, c=zero, period=period, gcode=steps_gcode(test, dialect))
@@ -417,7 +421,7 @@ def predict(
     from omsm_ros.core.kinematics.scan_path import ScanPath
 
     path = ScanPath(z=motion.z, sample_period=motion.period, x=motion.x, c=motion.c)
-    found = predict_error(calibration.core, path, accuracy)
+    found = predict_error(_checked(calibration, Calibration).core, path, accuracy)
     error = dynamic_error(calibration.core.dynamics, motion.z, motion.period)
     return Prediction.of(found, error=error, period=motion.period)
 

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from omsm_ros.core.calibration.calibration import Calibration as _Calibration
-from omsm_ros.core.lti.frequency_response import low_frequency_delay_uncertainty
 from omsm_ros.core.lti.transfer_function import TransferFunction, to_control
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, on_counts
 from omsm_ros.errors import ConfigurationError, DataError
@@ -78,7 +77,7 @@ class Calibration(Result):
     @property
     def lag_uncertainty(self) -> float:
         """Standard uncertainty of :attr:`lag` [s]."""
-        return low_frequency_delay_uncertainty(self.core.dynamics, self.core.covariance)
+        return self.core.low_frequency_delay_uncertainty
 
     @property
     def verdict(self) -> str:

@@ -65,6 +65,19 @@ def test_arrays_give_the_same_as_a_recording(identified):
         omsm.identify(made.z)
 
 
+def test_paths_and_exchanged_arguments_are_named_with_the_remedy(identified):
+    for call in (
+        lambda: omsm.correct("scan.mcap", identified),
+        lambda: omsm.correct(omsm.simulate("scan", radius=1e-3), "cal.json"),
+        lambda: omsm.predict(omsm.plan(), "cal.json"),
+        lambda: omsm.form("cloud.ply", omsm.surface("flat", level=0.0)),
+    ):
+        with pytest.raises(ConfigurationError, match=r"is no .*; use omsm\.read or omsm\.load"):
+            call()
+    with pytest.raises(ConfigurationError, match=r"omsm\.read\(path\)"):
+        omsm.identify("steps.mcap")
+
+
 def test_a_bag_is_read_as_it_was_written(tmp_path):
     made = scan_of(Scenario(start_radius=5e-4))
     back = omsm.read(write_recording(tmp_path / "scan.mcap", made))

@@ -113,16 +113,14 @@ batch --scheduler: address of a Dask scheduler: tcp:// on this host, or tls://
 calset placed: calibrations and their positions: x or z in metres, b in radians
 compare more: three or more: test whether they repeat within their uncertainties
 compensate --low-pass: cutoff wavelength, of which half is compensated [m]; shorter waves remain
-compensate --previous: of the cut that made this part: its effect is checked, and the offsets are
-    added to it
+compensate --previous: offsets of the last cut: their effect is checked, the new ones are added
 correct --accuracy: largest expanded uncertainty of PV that the verdict accepts, k = 2 [m]
 correct --delay: time from the probe's stamp to the middle of its exposure [s]
 correct --pitch: measured pitch of Z: columns z_m,pitch_rad; needs abbe_arm in the geometry
 correct --probe-latency: latency of the probe against X and C [s]; default: of the calibration
 correct --sources: uncertainty sources of the machine, or JSON such as {"encoder_noise": 4e-10}
 demo --experiment: repeat an experiment of the paper on the twin, Fig. 6 to 11; needs no ROS
-difference --correlation-length: correlation length of errors of unknown form [m]; default: half the
-    radius
+difference --correlation-length: of errors of unknown form [m]; default: half the radius
 difference --drift: standard deviation of the drift at the end of a scan [m]; default: from its
     sources, or estimated from the difference
 difference --register: register each to the nominal surface first, as 'omsm form' does: 'auto', or
@@ -145,13 +143,11 @@ identify --multisine: recording of a multisine on the fixed target: confirms the
 identify --settings: settings of machine and probe that the calibration is valid for
 identify recordings: bags of motions on a fixed target, or tables RECORD.csv, that one model
     describes
-inspect --repair: copy the intact part of a damaged MCAP bag to <bag>.repaired.mcap; the bag itself
-    is not changed
+inspect --repair: copy the intact part of an MCAP bag to <bag>.repaired.mcap; the bag is unchanged
 plan --count: number of steps up, and of steps down, from the middle
 plan --dwell: time from edge to edge [s]; four times the dwell halves the undetected creep
 plan --rate: rates of the probe [Hz], the preferred one first
-plan --sharp: edges as sharp as the axis makes them, for 'omsm identify --equivalent-time' alone: as
-    a calibration they mislead
+plan --sharp: edges without ramps, for 'omsm identify --equivalent-time' alone, not to calibrate
 plan what: a step test, a multisine that shows how linear the machine is, scans of a part, or speed
     and feed that avoid modes and lines
 predict --limits: limits of servo, probe, spindle and axes, as config/limits.yaml; default: the

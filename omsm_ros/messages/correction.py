@@ -12,7 +12,7 @@ correction.from_samples: from sample to sample of this scan
 correction.in_probe_noise: included in probe_noise, the scatter of heights at standstill
 correction.from_path: on the path of this scan
 correction.from_covariance: covariance of the calibration
-correction.latency_in_lag: not separated from the lag, of which any share may be latency
+correction.latency_in_lag: between zero and the whole lag: a step test does not separate them
 correction.from_certificate: certificate of the calibration
 # Statements about sources
 correction.source: uncertainty {source} is unknown, expected one of {known:list}

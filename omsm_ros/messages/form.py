@@ -19,9 +19,9 @@ form.low_pass_too_short: low-pass of {low_pass!r} m is finer than the points res
     {least!r} m or more; measure more points, or compensate less
 form.one_row: the points lie within one row of cells of {pitch!r} m, so that nothing is known across
     it; measure more tracks
-form.last_cut: the last cut changed the form by {share:.2f} of what it was asked to ({asked:m} rms),
-    expected 1; near -1 the sign of the offsets or of Z is reversed, else check clocking, X, and
-    that the program was cut; no further cut is computed
+form.last_cut: the last cut changed the form by {share:.2f} of the requested change ({asked:m}
+    rms), expected 1; near -1 the sign of the offsets or of Z is reversed, else check clocking, X,
+    and that the program was cut; no further cut is computed
 form.tool_too_blunt: a nose of {tool_radius:m} does not fit into the surface; choose a sharper tool
 form.spiral_below_one_turn: spiral of {feed:m} a turn from a rim of {rim:m} makes less than one
     turn; take a narrower feed

@@ -39,8 +39,8 @@ ripple.same_wavelength_on_radius: the same wavelength from ring to ring in {scan
 ripple.aliased_texture: {scans:list} resolves a texture of {wavelength:m/4}, shorter than twice the
     sampling distance here; this line is its alias
 ripple.same_order: {order} waves a turn in {scans:list} as well, at another speed
-ripple.order_or_form_on_circle: on one circle a form error of the part of that order looks the same,
-    and its nominal form if {opt.nominal} is not given
+ripple.order_or_form_on_circle: on one circle a form error of that order looks the same, and so does
+    the nominal form if {opt.nominal} is not given
 ripple.same_frequency: the same frequency in {scans:list}, at another speed over the part
 ripple.rate: {rate:Hz/4}
 ripple.other_rates: present in {scans:list}, sampled at {rates:list}, where {frequency:Hz/6} is
@@ -53,10 +53,10 @@ ripple.aliased_at: sampled at {rate:Hz/4} its alias is {frequency:Hz/6}
 ripple.coincident_lines: coincides here with a line that is {kind}: in other scans this line has
     {amplitude:m}, the other {other:m}
 ripple.coincident_source: coincides here with {amplitude:m} {kind}
-ripple.sharp_on_path: sharp along the path, broad over time, because the pace changed
+ripple.sharp_on_path: sharp along the path, broad over time, because the speed changed
 ripple.sharp_on_turns: {order} waves a turn, broad over time, because the speed of the spindle
     changed
-ripple.sharp_on_time: sharp over time, broad over path and turns, because the pace changed
+ripple.sharp_on_time: sharp over time, broad over path and turns, because the speed changed
 ripple.missing_in: not {kind}: missing in {scans:list}
 ripple.true_frequency: {scan} shows its true frequency: {frequency:Hz/6}
 # Measurements that would decide.

@@ -61,13 +61,13 @@ def part(mapping: Mapping[str, Any], *path: str) -> Any:
 
 
 def budget_table(summary: Mapping[str, object]) -> Table:
-    """Return the sources of uncertainty, the largest first, in one row those not evaluated."""
+    """Return the sources, with their names in SOURCES.yaml, the largest first, others in a row."""
     rows: Sequence[Mapping[str, Any]] = part(summary, "budget", "sources") or ()
     known = [row for row in rows if row["status"] != _OPEN]
     known.sort(key=lambda row: -(row["height"] or 0.0))
     heights = column([row["height"] for row in known], "m")
     ordered = [_budget_row(row, height) for row, height in zip(known, heights, strict=True)]
-    if missing := [row["says"] or row["source"] for row in rows if row["status"] == _OPEN]:
+    if missing := [f"{r['says']} ({r['source']})" for r in rows if r["status"] == _OPEN]:
         ordered.append((_OPEN, NOTHING, NOTHING, NOTHING, "; ".join(missing)))
     return Table(
         "Uncertainty of the heights, k = 1, rms over the scan",
@@ -81,7 +81,7 @@ def _budget_row(row: Mapping[str, Any], height: str) -> tuple[str, ...]:
     size = row["standard_uncertainty"]
     known = f"{row['status']}: {row['reason']}" if row["reason"] else row["status"]
     return (
-        f"{row['source'].replace('_', ' ')} ({row['says']})",
+        f"{row['says']} ({row['source']})",
         NOTHING if row["source"] in OF_CALIBRATION else sized(size, row["unit"], 2),
         height,
         "none" if row["kind"] == "random" else "all points",

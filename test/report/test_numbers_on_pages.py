@@ -65,12 +65,12 @@ def test_the_budget_has_every_source_once_the_largest_first(sources):
         t for t in page_of({"budget": {"sources": rows}}).tables if t["title"].startswith("Uncert")
     )
     shown = {row[0]: row[1:] for row in found["rows"]}
-    missing = [row["says"] for row in rows if row["reason"]]
+    missing = [f"{row['says']} ({row['source']})" for row in rows if row["reason"]]
     known = [row for row in rows if not row["reason"]]
     assert len(shown) == len(known) + bool(missing)
     largest = max((row["height"] or 0.0 for row in known), default=0.0)
     for row in known:
-        size, height, acts, basis = shown[f"{row['source'].replace('_', ' ')} ({row['says']})"]
+        size, height, acts, basis = shown[f"{row['says']} ({row['source']})"]
         assert says(size, row["standard_uncertainty"], 2)
         assert says(height, row["height"], largest=largest)
         assert acts == ("none" if row["kind"] == "random" else "all points")
@@ -134,7 +134,7 @@ def test_limits_say_how_far_they_are_and_the_tightest_comes_first(limits):
         assert says(value, limit["value"])
         assert says(allowed, limit["allowed"])
         # A factor of speed is rounded down, to the safe side.
-        shown, real = value_of(factor.removesuffix(" ×")), limit["speed_factor"]
+        shown, real = value_of(factor.removeprefix("≥ ").removesuffix(" ×")), limit["speed_factor"]
         assert shown <= real * (1 + 1e-12)
         assert real - shown <= 0.01 * real
     factors = [content[int(row[0].removeprefix("limit "))]["speed_factor"] for row in table["rows"]]

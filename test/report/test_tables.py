@@ -79,8 +79,9 @@ class TestBudgetAndMotion:
             row("probe_noise", 1e-8, 1e-8),
         ]
         rows = tables.budget_table({"budget": {"sources": sources}}).rows
-        names = [row[0].split(" (")[0] for row in rows]
-        assert names == ["probe noise", "encoder noise", "not evaluated"]
+        names = ["of it (probe_noise)", "of it (encoder_noise)", "not evaluated"]
+        assert [row[0] for row in rows] == names
+        assert rows[2][-1] == "of it (tilt_of_it)"
         assert rows[0][2] == "10.0 nm"
         assert rows[1][1] == "2.0 nm"
         assert rows[2][1:4] == ("–", "–", "–")

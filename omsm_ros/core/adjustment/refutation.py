@@ -35,8 +35,7 @@ _OFFSET = "lag_change"
 _MOST_RELEASED = 8
 # Further culprits that are tried first.
 _MOST_TRIED = 3
-# Priors: a machine has one of ten errors that are not declared; one of ten adjustments has a wrong
-# declaration.
+# Prior odds against an error that is not declared, and against a wrong declaration in a machine.
 ODDS_ABSENT, SURE = 9.0, 50.0
 # A smaller probability lies outside an interval of 95 %.
 _LEAST_LIKELY = 0.05

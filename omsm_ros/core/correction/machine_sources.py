@@ -169,7 +169,7 @@ def with_assumed(stated: MachineSources) -> MachineSources:
     Without them the uncertainty of one scan would contain no change since the step test.
     """
     assumed = tuple(
-        StatedSource(source=name, value=size, how=ASSUMED, reason="not evaluated; plausible size")
+        StatedSource(source=name, value=size, how=ASSUMED, reason="a plausible size")
         for name, size in ASSUMED_SIZES.items()
         if not stated.of(name)
     )

@@ -78,7 +78,7 @@ def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class EdgeMean:
-    """Output less model, all edges on top of each other, downward ones turned over.
+    """Output less model, all edges superimposed, downward ones inverted.
 
     time: since the middle of the edge [s];  mean: [m], both (k,);  edges: how many
     """

@@ -44,8 +44,8 @@ CAPTIONS = {
     ),
     "step": "The steepest move: input, output, and the residual of the model.",
     "residual": (
-        "The residual over the whole recording, at the edges on top of each other "
-        "(downward ones turned over), and from sample to sample."
+        "The residual over the whole recording, its mean over all edges (downward ones inverted), "
+        "and its autocorrelation."
     ),
     "order": ("Each candidate is a structure that was fitted to the same samples."),
 }
@@ -53,8 +53,8 @@ RECORD, CORRELATION = "record", "correlation"
 CAPTIONS_OF_MODEL = {
     BAND: "Gain and phase with their 95 % band. Grey: not known within the limits.",
     RECORD: (
-        "The record, and what the model makes of its input alone; the state that it starts in "
-        "is fitted."
+        "The record, and the free run of the model from the input alone; its initial state is "
+        "fitted."
     ),
     CORRELATION: "From sample to sample: outside the shade the residual is not white.",
 }

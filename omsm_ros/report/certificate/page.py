@@ -21,7 +21,7 @@ from omsm_ros.units import DEGREE_RAD, PPM
 _CLOSING = (
     "On a fixed target the probe reads offset + drift ∓ static gain · G_m z, with G_m(0) = 1 and z "
     "from the encoder. The sign is − where the distance falls when Z rises, else +. "
-    "After ± stands the standard uncertainty, k = 1; bands are 95 %."
+    "± states the standard uncertainty, k = 1; bands are 95 %."
 )
 
 

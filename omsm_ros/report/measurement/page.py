@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.kinematics.limits import FASTEST
 from omsm_ros.readable import (
     NOTHING,
     date_text_of_stamp,
@@ -185,7 +186,8 @@ def limits_table(summary: Mapping[str, Any]) -> Table:
             str(limit["name"]),
             _size(limit["value"], limit["unit"]),
             _size(limit["allowed"], limit["unit"]),
-            f"{plain(rounded_down(limit['speed_factor']))} ×",
+            "≥ " * (limit["speed_factor"] >= FASTEST)
+            + f"{plain(rounded_down(limit['speed_factor']))} ×",
         )
         for limit in limits
     ]

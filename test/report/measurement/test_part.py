@@ -144,10 +144,11 @@ def test_the_tightest_limit_comes_first():
     limits = [
         {"name": "dynamics", "value": 6e-9, "allowed": 25e-9, "unit": "m", "speed_factor": 20.0},
         {"name": "spindle", "value": 30.0, "allowed": 120.0, "unit": "rpm", "speed_factor": 4.0},
+        {"name": "range", "value": 1e-6, "allowed": 5e-5, "unit": "m", "speed_factor": 100.0},
     ]
     table = limits_table({"prediction": {"limits": limits}})
-    assert [row[0] for row in table.rows] == ["spindle", "dynamics"]
-    assert "4.00" in table.rows[0][-1]
+    assert [row[0] for row in table.rows] == ["spindle", "dynamics", "range"]
+    assert [row[-1] for row in table.rows] == ["4.00 ×", "20.0 ×", "≥ 100 ×"]
     assert not limits_table({}).rows
 
 
