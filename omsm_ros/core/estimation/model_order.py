@@ -249,8 +249,6 @@ class StartingPoints:
         """Return ψ of ``structure``, given the fits made so far."""
         scaled = ScaledStructure(structure, self.problem.rate)
         delay = float(self.pure_delay.nonlinear[-1]) if self.pure_delay.structure.delay else 0.0
-        if structure.poles == 0:
-            return [self.pure_delay.nonlinear]
         kept = _KEPT_DELAY * delay if structure.delay else 0.0
         found = [scaled.nonlinear_of(self._linear(structure, kept), kept)]
         contained = [f for f in smaller if structure.contains(f.structure)]

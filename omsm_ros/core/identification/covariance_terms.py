@@ -148,19 +148,15 @@ def contrast_covariance(found: Sequence[PartsCompared], dynamics: TransferFuncti
 
 def undetected_covariance(
     diagnostics: ResidualDiagnostics,
-    settings: Mapping[str, object],
+    priors: Mapping[str, float],
     drift: Sequence[slice],
     use: IntendedUse,
 ) -> tuple[list[FloatArray], Undetected]:
     """Return covariances (p, p) of undetected terms, and the terms for the certificate.
 
     drift: columns of the background that model a drift
-    settings: may hold "priors", standard uncertainties by the name of a family; a term is taken
-        no larger than its prior
-
-    Raises ConfigurationError for a prior of another family, or that is no positive number.
+    priors: see :func:`priors_of`; a term is taken no larger than its prior
     """
-    priors = _priors(settings)
     terms = undetected_terms(diagnostics, drift, use)
     gain, slowest = max(
         ((_carried(t, priors) * t.above, t.parameter) for t in terms if t.family == CREEP),
@@ -177,7 +173,11 @@ def undetected_covariance(
     return [term.covariance(_carried(term, priors)) for term in terms], found
 
 
-def _priors(settings: Mapping[str, object]) -> dict[str, float]:
+def priors_of(settings: Mapping[str, object]) -> dict[str, float]:
+    """Return the "priors" of ``settings``, standard uncertainties by the name of a family.
+
+    Raises ConfigurationError for a prior of another family, or that is no positive number.
+    """
     stated = settings.get("priors", {})
     if not isinstance(stated, Mapping):
         raise ConfigurationError("identification.priors", value=repr(stated))

@@ -49,6 +49,7 @@ from omsm_ros.core.identification.checks import CHECKS, limits_of
 from omsm_ros.core.identification.covariance_terms import (
     contrast_covariance,
     inter_sample_delay_bound,
+    priors_of,
     reference_lag,
     undetected_covariance,
 )
@@ -151,7 +152,8 @@ def identify(
     did not measure it, ConfigurationError for an impossible input or mass. A model that cannot be
     trusted is returned with the verdict "rejected" in its certificate.
     """
-    mass, prepared = table_mass(settings or {}), prepare(record, input)
+    mass, priors = table_mass(settings or {}), priors_of(settings or {})
+    prepared = prepare(record, input)
     check_axis_steps(prepared)
     progress(STEPS, steps=len(prepared.steps.edges))
     budget = budget or EvaluationBudget()
@@ -161,7 +163,7 @@ def identify(
     progress(UNCERTAINTY)
     best = searched.model.chosen.fit
     check_gain(best.gain)
-    evidence = _evidence(record, searched, input, settings or {}, use)
+    evidence = _evidence(record, searched, input, priors, use)
     findings = [finding for check in CHECKS for finding in check(evidence)]
     calibration = Calibration(
         dynamics=best.dynamics,
@@ -196,7 +198,7 @@ def _evidence(
     record: MotionRecord,
     searched: SearchResult,
     input: str,
-    settings: Mapping[str, object],
+    priors: Mapping[str, float],
     use: IntendedUse,
 ) -> IdentificationEvidence:
     """Return what the checks use: the uncertainty of the response, and what it consists of."""
@@ -207,7 +209,7 @@ def _evidence(
         if nuisance_terms.term.family == DRIFT
     ]
     best, diagnostics = model.chosen.fit, searched.diagnostics
-    further, undetected = undetected_covariance(diagnostics, settings, drift, use)
+    further, undetected = undetected_covariance(diagnostics, priors, drift, use)
     further += [
         alternative_mode_covariance(before, term, best)
         for before, term in zip(searched.without, searched.added_poles, strict=True)

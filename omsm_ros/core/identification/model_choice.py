@@ -97,6 +97,8 @@ def choose_model(
     refilled = lru_cache(maxsize=1)(part.filled) if part else None
 
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
+        if structure == lag.structure:
+            return lag
         same = known.get(structure)
         starts = points.of(structure, smaller) if same is None else [same.nonlinear]
         best = min(smaller, key=lambda fit: fit.sum_of_squares, default=lag)

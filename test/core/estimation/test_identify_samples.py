@@ -13,7 +13,6 @@ from soaked import soaked
 from omsm_ros.core.estimation import sampled_choice
 from omsm_ros.core.estimation.parallel_sections import HOLDS, ParallelSections
 from omsm_ros.core.estimation.sampled_choice import (
-    EXPLORED_ON,
     SampledCandidate,
     choose_sampled,
     simplest_undominated,
@@ -109,9 +108,7 @@ def test_units_do_not_matter():
 
 
 def test_an_order_asked_for_is_known_no_better_than_the_free_choice_leaves_open():
-    found = recorded("zero-order", noise=0.02)
-    free, low = (identified(*found, order=order) for order in (0, 1))
-    assert free.certificate["order"] == 2
+    low = identified(*recorded("zero-order", noise=0.02), order=1)
     assert low.certificate["order"] == 1
     assert low.certificate["free_order"] == 2
     assert any("was asked for" in text for text in low.certificate["warnings"])
@@ -245,13 +242,19 @@ def test_poles_beyond_the_data_are_bounds():
     assert any("faster_than_hz" in p for p in poles)
 
 
+@pytest.fixture(scope="module")
+def good():
+    """The choice for a good record."""
+    return choose_sampled([record(*recorded("zero-order"))], "zero-order", max_delay=3)
+
+
 @pytest.fixture
-def certified(monkeypatch):
+def certified(monkeypatch, good):
     """The certificate of a good record, with one piece of evidence replaced."""
 
     def made(worse=False, held_out=None, **replaced):
         def chosen(*records, **options):
-            found = choose_sampled(*records, **options)
+            found = good
             if held_out is not None:
                 found = replace(found, chosen=replace(found.chosen, held_out=held_out))
             return replace(found, worse=worse)
@@ -346,11 +349,10 @@ def test_a_square_wave_that_follows_two_sines_is_known_at_those_at_most():
     assert high <= low or (low >= 16 / 1.3 and high < 23 * 1.3)
 
 
-def test_a_long_record_is_explored_on_a_part_and_fitted_on_all():
-    rng = np.random.default_rng(2)
-    samples = 2 * EXPLORED_ON + 3000
-    u = np.repeat(rng.choice([-1.0, 1.0], samples // 4), 4)[:samples]
-    samples = len(u)
+def test_a_long_record_is_explored_on_a_part_and_fitted_on_all(monkeypatch):
+    monkeypatch.setattr(sampled_choice, "EXPLORED_ON", 2000)
+    rng, samples = np.random.default_rng(2), 5000
+    u = np.repeat(rng.choice([-1.0, 1.0], samples // 4), 4)
     b, a = [0.0, 0.142, 0.135], [1.0, -1.584, 0.861]
     y = signal.lfilter(b, a, u) + rng.normal(0, 0.05, samples)
     model = identified(u, y, 1.0)
@@ -366,9 +368,9 @@ def test_a_long_record_is_explored_on_a_part_and_fitted_on_all():
 def test_a_change_of_the_plant_is_seen():
     """The first third follows the input, the rest does not: no free run predicts that."""
     rng = np.random.default_rng(6)
-    u = np.repeat(rng.choice([-1.0, 1.0], 750), 4)
+    u = np.repeat(rng.choice([-1.0, 1.0], 300), 4)
     y = signal.lfilter([0.0, 0.3], [1.0, -0.7], u)
-    y[1000:] = np.cumsum(rng.normal(0, 1, 2000))
+    y[400:] = np.cumsum(rng.normal(0, 1, 800))
     assert identified(u, y, 1.0).certificate["verdict"] == "rejected"
 
 

@@ -114,8 +114,7 @@ def test_samples_that_are_lost_together_support_no_range(seed):
     assert model.valid[0][1] < 0.15
 
 
-@pytest.mark.parametrize(("order", "accepted"), [(2, False), (4, True)])
-def test_a_model_of_too_few_poles_whose_residual_follows_the_input_is_rejected(order, accepted):
+def test_a_model_of_too_few_poles_whose_residual_follows_the_input_is_rejected():
     """One of two modes is missing: a sweep shows it for a while, so most of the record is right."""
     rng, used = np.random.default_rng(1), np.ones(4000, bool)
     used[100:230] = False
@@ -127,7 +126,7 @@ def test_a_model_of_too_few_poles_whose_residual_follows_the_input_is_rejected(o
         output += gain * signal.lfilter([0.0, np.sum(down)], down, sweep)
     output += 0.1 * np.std(output) * rng.normal(size=4000)
     record = SampledRecord(sweep[:, np.newaxis], np.where(used, output, 0.0), used)
-    certificate = identify_samples([record], 1.0, order=order).certificate
+    certificate = identify_samples([record], 1.0, order=2).certificate
     assert certificate["predicted"] > 0.75
-    assert certificate["verdict"].startswith("accepted") == accepted
-    assert any("residual that follows" in why for why in certificate["reasons"]) != accepted
+    assert certificate["verdict"] == "rejected"
+    assert "residual that follows" in certificate["reasons"][0]

@@ -71,6 +71,7 @@ def test_only_a_significant_drift_can_mask_a_relaxation():
 def test_a_machine_that_wanders_a_little_is_calibrated():
     """6 nm in a second: the response is known, and what it is open by is said."""
     calibration = identify(late_record(-walk(6e-9))).calibration
+    assert {error.family for error in calibration.certificate.model_errors.modelled} <= {DRIFT}
     assert str(calibration.certificate.verdict).startswith("accepted with reservations")
     at = np.array([1.0])
     off = abs(calibration.dynamics.response(at) * np.exp(2j * np.pi * at * LAG) - 1)
@@ -123,7 +124,7 @@ def test_next_to_a_relaxation_lag_and_roll_off_stay_independent():
     assert structure.size >= pole_and_zero + lag_and_roll_off
 
 
-@pytest.mark.parametrize("seed", [0, *soaked(1, 2)])
+@pytest.mark.parametrize("seed", soaked(0, 1, 2))
 def test_a_random_walk_is_no_relaxation_and_no_soft_mode(seed):
     """What polynomials leave of it has more power the slower it is; it is noise, not a response."""
     prepared = prepare(late_record(walk(4e-9, seed)), "encoder")

@@ -282,7 +282,7 @@ class TestUndetectedTerms:
     @pytest.mark.parametrize("prior", ["small", *soaked(0.0, -1.0, True)])
     def test_a_prior_is_a_positive_number(self, prior):
         with pytest.raises(ConfigurationError, match="expected a positive number"):
-            identify(record_of(), settings={"priors": {CREEP: prior}})
+            identify(record_of(), settings={"priors": {CREEP: prior}}, progress=too_late)
 
     def test_the_size_of_a_slow_pole_is_its_share_at_rest(self):
         # 1 - ε + ε / (1 + sτ) beside a pole of 1 ms.
@@ -291,6 +291,10 @@ class TestUndetectedTerms:
             [1.0, slow * (1 - size)], [1.0, slow + fast, slow * fast]
         )
         assert fitted_relaxation(dynamics) == pytest.approx(size, rel=1e-2)
+
+
+def too_late(stage, **_):
+    raise AssertionError(stage)
 
 
 def follows(p):
