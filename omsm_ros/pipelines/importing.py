@@ -321,13 +321,13 @@ def _table(path: Path, suffix: str, form: TableForm) -> ForeignTable:
 
 
 def _topics(path: Path, wanted: Sequence[str]) -> list[ForeignTable]:
-    from omsm_ros.io.tables.binary_table import ForeignBag
+    from omsm_ros.io.tables.binary_table import topics_of
 
-    bag = ForeignBag(path)
-    topics = bag.topics()
+    topics = topics_of(path)
     found: list[ForeignTable] = [t for t in topics if set(t.names) & set(wanted)]
     if not found:
-        bag.close()
+        for topic in topics:
+            topic.close()
         held = [name for t in topics for name in t.names if name.startswith("/")]
         raise FileError(
             f"bag {str(path)!r} has none of the columns {list(wanted)}, but {held[:20]}; "

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from omsm_ros.errors import BagError
 from omsm_ros.io import bag_checks, bags, message_mapping
 from omsm_ros.io.bag_writer import BagWriter
-from omsm_ros.io.tables.binary_table import ForeignBag
+from omsm_ros.io.tables.binary_table import topics_of
 
 AXES = bags.TOPIC_TYPES[bags.AXES_TOPIC]
 
@@ -245,7 +245,7 @@ NESTED_ALIASES = "&a [x, x, x, x, x, x, x, x, x]\n" + "".join(
 
 
 def test_a_folder_that_is_no_bag_is_named(tmp_path, written):
-    for read in (records, ForeignBag):
+    for read in (records, topics_of):
         with pytest.raises(BagError, match=r"without metadata\.yaml.*give one of its \.mcap files"):
             read(tmp_path)
 
@@ -259,7 +259,7 @@ def test_metadata_with_aliases_is_refused_at_once(tmp_path, message):
     bomb = text.replace("compression_format: ''", "compression_format: *i")
     metadata.write_text(f"a: {NESTED_ALIASES}{bomb}")
     start = process_time()
-    for read in (records, ForeignBag):
+    for read in (records, topics_of):
         with pytest.raises(BagError, match="aliases or anchors"):
             read(folder)
     assert process_time() - start < 1.0
@@ -338,7 +338,7 @@ def test_a_file_of_a_folder_that_unpacks_to_gigabytes_is_refused(tmp_path, messa
     with pytest.raises(BagError, match="unpacks to 100 times its"):
         records(folder)
     with pytest.raises(BagError, match="unpacks to 100 times its"):
-        ForeignBag(folder)
+        topics_of(folder)
 
 
 def defined_in(folder, lines):
@@ -354,7 +354,7 @@ def test_definitions_that_take_minutes_to_take_apart_are_not(tmp_path):
     path = defined_in(tmp_path / "long", 300_000)
     start = process_time()
     with pytest.raises(BagError, match="defines its messages in 300000 lines"):
-        ForeignBag(path)
+        topics_of(path)
     with pytest.raises(BagError, match="another definition of"):
         records(path)
     assert process_time() - start < 1.0

@@ -333,32 +333,22 @@ _PART = re.compile(r"([^.\[\]]+)(?:\[([^\[\]]*)\])?")
 _Get = Callable[[Any], float]
 
 
-class ForeignBag:
-    """Opens a bag of any topics for reading."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        with bag_errors(path, _REMEDY), ExitStack() as opening:
-            check_files(path)
-            self.reader = AnyReader([path], default_typestore=_standard())
-            if self.reader.is2:
-                check_length_of_definitions(path)
-            opening.enter_context(self.reader)
-            if self.reader.is2:
-                for part in self.reader.readers:
-                    assert isinstance(part, Reader)
-                    check_index(path, part)
-                check_checksums(path)
-            self._stack = opening.pop_all()
-
-    def close(self) -> None:
-        """Close the files."""
-        self._stack.close()
-
-    def topics(self) -> list[TopicTable]:
-        """Return a table for each topic."""
-        names = sorted({c.topic for c in self.reader.connections if c.msgcount})
-        return [TopicTable(self, topic) for topic in names]
+def topics_of(path: Path) -> list[TopicTable]:
+    """Open a bag of any topics, and return a table for each; closing one closes the bag."""
+    with bag_errors(path, _REMEDY), ExitStack() as opening:
+        check_files(path)
+        reader = AnyReader([path], default_typestore=_standard())
+        if reader.is2:
+            check_length_of_definitions(path)
+        opening.enter_context(reader)
+        if reader.is2:
+            for part in reader.readers:
+                assert isinstance(part, Reader)
+                check_index(path, part)
+            check_checksums(path)
+        opened = opening.pop_all()
+    names = sorted({c.topic for c in reader.connections if c.msgcount})
+    return [TopicTable(path, reader, opened, topic) for topic in names]
 
 
 @lru_cache(maxsize=1)
@@ -372,12 +362,10 @@ class TopicTable(ForeignTable):
 
     units_in_names = False  # position[A] is a joint
 
-    def __init__(self, bag: ForeignBag, topic: str) -> None:
-        super().__init__(bag.path)
-        self._bag, self._topic = bag, topic
-        self._connections: list[Connection] = [
-            c for c in bag.reader.connections if c.topic == topic
-        ]
+    def __init__(self, path: Path, reader: AnyReader, opened: ExitStack, topic: str) -> None:
+        super().__init__(path)
+        self._reader, self._opened, self._topic = reader, opened, topic
+        self._connections: list[Connection] = [c for c in reader.connections if c.topic == topic]
         kinds = sorted({c.msgtype for c in self._connections})
         if len(kinds) > 1:
             raise BagError(f"{self} has messages of {kinds}; record them on topics of their own")
@@ -395,15 +383,10 @@ class TopicTable(ForeignTable):
         """Return the bag's path and the topic."""
         return f"{self.path}:{self._topic}"
 
-    def close(self) -> None:
-        """Close the bag, also for its other topics."""
-        self._bag.close()
-
     def _messages(self) -> Iterator[tuple[int, Any]]:
-        reader = self._bag.reader
         with bag_errors(self.path, _REMEDY):
-            for _, stamp_ns, raw in reader.messages(self._connections):
-                yield stamp_ns, reader.deserialize(raw, self._kind)
+            for _, stamp_ns, raw in self._reader.messages(self._connections):
+                yield stamp_ns, self._reader.deserialize(raw, self._kind)
 
     def _pieces(
         self, names: Sequence[str], dates: frozenset[str]
