@@ -267,21 +267,37 @@ class BagReader:
         """Yield ``(topic, time of recording, serialised message)`` in the order of time [ns].
 
         start_ns, stop_ns: the first instant, and the end, which is excluded
+
+        Raises BagError if one of ``topics`` is absent or of another type, or if the number of
+        messages is not that of the index.
         """
         connections = [c for topic in topics for c in self._connections(topic)]
-        roles = self._roles(topics)
-        for connection, stamp, raw in self._raw(connections, start_ns, stop_ns):
-            yield roles[connection.topic], stamp, raw
+        roles = {self._names[topic]: topic for topic in topics}
+        promised = sum(connection.msgcount for connection in connections)
+        with bag_errors(self.path, DAMAGED):
+            if connections:
+                for connection, stamp, raw in self._reader.messages(connections, start_ns, stop_ns):
+                    promised -= 1
+                    if not isinstance(raw, _BYTES):  # SQLite keeps any type in any column
+                        raise BagError(
+                            f"bag {str(self.path)!r}: a message is {shown(raw)}, not bytes: "
+                            f"{DAMAGED}"
+                        )
+                    unpacked: Any = unpacked_message(bytes(raw)) if self._compressed else raw
+                    yield roles[connection.topic], stamp, unpacked
+        if promised and start_ns is None and stop_ns is None:
+            more_or_less = "fewer" if promised > 0 else "more"
+            raise BagError(
+                f"bag {str(self.path)!r} holds {abs(promised)} messages {more_or_less} than its "
+                f"index says: {DAMAGED}"
+            )
 
     def records(self, *topics: str) -> Iterator[Item]:
         """Yield ``(topic, record)`` in the order of recording.
 
-        Raises BagError if one of ``topics`` is absent, of another type, or malformed.
+        Raises BagError as :meth:`messages` does, or if a message is malformed.
         """
-        connections = [c for topic in topics for c in self._connections(topic)]
-        roles = self._roles(topics)
-        for connection, _, raw in self._raw(connections):
-            topic = roles[connection.topic]
+        for topic, _, raw in self.messages(topics):
             yield topic, self._record(topic, raw)
 
     def probe_settings(self) -> list[dict[str, object]]:
@@ -309,12 +325,10 @@ class BagReader:
 
         The blocks of a topic keep their order. Raises BagError as :meth:`records` does.
         """
-        connections = [c for topic in topics for c in self._connections(topic)]
         waiting: defaultdict[str, list[bytes]] = defaultdict(list)
         size = read = 0
-        roles = self._roles(topics)
-        for connection, _, raw in self._raw(connections):
-            waiting[roles[connection.topic]].append(raw)
+        for topic, _, raw in self.messages(topics):
+            waiting[topic].append(raw)
             size += len(raw)
             read += 1
             if size >= _JOINED_BYTES:
@@ -349,35 +363,6 @@ class BagReader:
                 f"bag {str(self.path)!r} holds a malformed message: {err}; leave it out with "
                 "'omsm inspect --repair'"
             ) from err
-
-    def _raw(
-        self,
-        connections: Sequence[Connection],
-        start_ns: int | None = None,
-        stop_ns: int | None = None,
-    ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield the serialised messages; their number must be that of the index."""
-        promised = sum(connection.msgcount for connection in connections)
-        with bag_errors(self.path, DAMAGED):
-            if connections:
-                for connection, stamp, raw in self._reader.messages(connections, start_ns, stop_ns):
-                    promised -= 1
-                    if not isinstance(raw, _BYTES):  # SQLite keeps any type in any column
-                        raise BagError(
-                            f"bag {str(self.path)!r}: a message is {shown(raw)}, not bytes: "
-                            f"{DAMAGED}"
-                        )
-                    unpacked: Any = unpacked_message(bytes(raw)) if self._compressed else raw
-                    yield connection, stamp, unpacked
-        if promised and start_ns is None and stop_ns is None:
-            more_or_less = "fewer" if promised > 0 else "more"
-            raise BagError(
-                f"bag {str(self.path)!r} holds {abs(promised)} messages {more_or_less} than its "
-                f"index says: {DAMAGED}"
-            )
-
-    def _roles(self, topics: Sequence[str]) -> dict[str, str]:
-        return {self._names[topic]: topic for topic in topics}
 
     def _connections(self, topic: str) -> list[Connection]:
         name = self._names[topic]
