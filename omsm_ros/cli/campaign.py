@@ -23,6 +23,7 @@ from omsm_ros.io.files import (
     REPORT,
     SUMMARY,
     exception_text,
+    explained_errors,
     load_object,
     make_folder,
     save_json,
@@ -220,17 +221,15 @@ def _save(out: Path, entries: dict[str, Entry]) -> None:
 def _locked(out: Path) -> Iterator[None]:
     """Lock the folder, so that two campaigns never write into it."""
     with ExitStack() as locked:
-        try:
+        said, remedy = f"cannot write into {str(out)!r}", "give another folder"
+        with explained_errors(said, remedy, caught=OSError):
             make_folder(out)
-            locked.enter_context(locked_folder(out, wait=False))
-        except BlockingIOError as err:
-            raise FileError(
-                f"another campaign writes into {str(out)!r}; wait until it has ended"
-            ) from err
-        except OSError as err:
-            raise FileError(
-                f"cannot write into {str(out)!r}: {exception_text(err)}; give another folder"
-            ) from err
+            try:
+                locked.enter_context(locked_folder(out, wait=False))
+            except BlockingIOError as err:
+                raise FileError(
+                    f"another campaign writes into {str(out)!r}; wait until it has ended"
+                ) from err
         yield
 
 
@@ -244,33 +243,26 @@ def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
         finally:
             executor.shutdown(cancel_futures=True)
         return
-    try:
+    said, remedy = f"scheduler {scheduler!r} is no address", "write tcp://host:port"
+    with explained_errors(said, remedy, ConfigurationError):
         address = urlsplit(scheduler)
-    except ValueError as err:
-        raise ConfigurationError(
-            f"scheduler {scheduler!r} is no address: {exception_text(err)}; write tcp://host:port"
-        ) from err
     local = address.scheme == "tcp" and address.hostname in _LOCAL_HOSTS
     if not (local or address.scheme == "tls"):
         raise ConfigurationError(
             f"scheduler {scheduler!r}: Dask runs any code it is sent, so on another host it must "
             "be tls://host:port, with the certificates in Dask's own configuration"
         )
-    try:
+    said, remedy = f"no scheduler answers at {scheduler!r}", "start one there with 'dask scheduler'"
+    with explained_errors(said, remedy, ConfigurationError, (OSError, ValueError, TypeError)):
         if local:
             # Dask itself waits without end for the greeting of a scheduler.
             with socket.create_connection((address.hostname, address.port), _ANSWER_S) as link:
                 link.recv(1)
-        from distributed import Client
-
+        try:
+            from distributed import Client
+        except ImportError as err:
+            raise ConfigurationError("--scheduler needs Dask: pip install distributed") from err
         client = Client(scheduler, timeout=_ANSWER_S)
-    except ImportError as err:
-        raise ConfigurationError("--scheduler needs Dask: pip install distributed") from err
-    except (OSError, ValueError, TypeError) as err:
-        raise ConfigurationError(
-            f"no scheduler answers at {scheduler!r}: {exception_text(err)}; start one there with "
-            "'dask scheduler'"
-        ) from err
     with client:
         # If a worker dies, another one takes over its bag.
         yield client.get_executor(pure=False, retries=3)

@@ -23,7 +23,7 @@ from omsm_ros.errors import BagError
 from omsm_ros.io.bag_checks import MAX_CHUNK_BYTES, check_unpacked, unpacked_chunk, unpacked_message
 from omsm_ros.io.bag_writer import GrowingFile, finish, new_bag_file, new_writer
 from omsm_ros.io.bags import check_message
-from omsm_ros.io.files import exception_text, open_regular
+from omsm_ros.io.files import exception_text, explained_errors, open_regular
 from omsm_ros.io.message_mapping import typestore
 from omsm_ros.io.topics import TOPIC_TYPES
 
@@ -82,15 +82,11 @@ def repair(path: Path) -> Repair:
 
 
 def _copy(parts: list[Path], file: GrowingFile, made: Repair) -> None:
-    try:
+    with explained_errors(f"cannot write {str(made.path)!r}", "make room", BagError, OSError):
         writer = new_writer(file)
         for part in parts:
             _Copy(part, writer, made).run(file.flush)
         finish(writer, file)
-    except OSError as err:
-        raise BagError(
-            f"cannot write {str(made.path)!r}: {exception_text(err)}; make room"
-        ) from err
     if not made.messages:
         why = made.lost[0] if made.lost else "nothing was recorded"
         raise BagError(f"{str(parts[0])!r} has no whole message to save ({why}); record it again")

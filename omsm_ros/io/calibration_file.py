@@ -16,7 +16,13 @@ from omsm_ros.core.calibration.calibration_set import (
 )
 from omsm_ros.errors import CalibrationError, FileError, named_errors
 from omsm_ros.io import json_and_yaml
-from omsm_ros.io.files import exception_text, read_text, save_json, temporary_sibling
+from omsm_ros.io.files import (
+    exception_text,
+    explained_errors,
+    read_text,
+    save_json,
+    temporary_sibling,
+)
 from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -198,9 +204,6 @@ class CalibrationFolder:
 
 def since(path: Path) -> int:
     """Return since when the calibration at ``path`` is in force [ns]; CalibrationError without."""
-    try:
+    said = f"no calibration at {str(path)[:200]!r}"
+    with explained_errors(said, "check the path", CalibrationError):
         return os.lstat(path).st_mtime_ns
-    except (OSError, ValueError) as err:
-        raise CalibrationError(
-            f"no calibration at {str(path)[:200]!r}: {exception_text(err)}"
-        ) from err

@@ -4,7 +4,7 @@ import os
 import secrets
 import stat
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -70,14 +70,26 @@ def load_object(
 
 
 @contextmanager
-def library_errors(what: str, remedy: str, error: type[FileError] = FileError) -> Iterator[None]:
-    """Raise ``error`` for any of the many exceptions that libraries raise on a damaged file."""
+def explained_errors(
+    what: str,
+    remedy: str,
+    error: type[OmsmError] = FileError,
+    caught: type[Exception] | tuple[type[Exception], ...] = (OSError, ValueError),
+) -> Iterator[None]:
+    """Raise ``error``, "what: why; remedy", for an exception ``caught`` within."""
     try:
         yield
     except error:
         raise
-    except Exception as err:
-        raise error(f"{what} cannot be read: {exception_text(err)}; {remedy}") from err
+    except caught as err:
+        raise error(f"{what}: {exception_text(err)}; {remedy}") from err
+
+
+def library_errors(
+    what: str, remedy: str, error: type[FileError] = FileError
+) -> AbstractContextManager[None]:
+    """Raise ``error`` for any of the many exceptions that libraries raise on a damaged file."""
+    return explained_errors(f"{what} cannot be read", remedy, error, Exception)
 
 
 def open_regular(path: Path | str, error: type[FileError], what: str) -> IO[bytes]:

@@ -21,7 +21,7 @@ from omsm_ros.io.files import (
     SPECTRUM,
     SUMMARY,
     SYSTEMATIC,
-    exception_text,
+    explained_errors,
     load_object,
     make_folder,
     temporary_sibling,
@@ -57,33 +57,22 @@ def result_folder(path: Path | str, names: Sequence[str]) -> Iterator[Path]:
     """
     target = Path(os.path.abspath(path))
     staged: Path | None = None
+    said = f"cannot write results into {str(path)!r}"
+    remedy = "check the folder, its rights and its room"
     try:
-        try:
+        with explained_errors(said, remedy):
             make_folder(target.parent)
             if target.exists() and not target.is_dir():
                 raise NotADirectoryError(None, "it is a file; give a folder")
             _refuse_foreign(target, names)
             staged = temporary_sibling(target)
             staged.mkdir()
-        except (OSError, ValueError) as err:
-            raise _refusal(path, err) from err
         yield staged
-        try:
+        with explained_errors(said, remedy):
             _move_into_place(staged, target, names)
-        except (OSError, ValueError) as err:
-            raise _refusal(path, err) from err
     finally:
         if staged is not None:
             shutil.rmtree(staged, ignore_errors=True)
-
-
-def _refusal(path: Path | str, err: Exception) -> FileError:
-    if isinstance(err, FileError):
-        return err
-    return FileError(
-        f"cannot write results into {str(path)!r}: {exception_text(err)}; check the folder, its "
-        "rights and its room"
-    )
 
 
 def _move_into_place(staged: Path, target: Path, names: Sequence[str]) -> None:
@@ -162,13 +151,9 @@ def runtime_folder(namespace: str = "") -> Path:
 
 
 def _make_own(folder: Path) -> None:
-    try:
+    with explained_errors(f"cannot make folder {str(folder)!r}", "check its rights"):
         folder.mkdir(mode=_MODE, parents=True, exist_ok=True)
         found = os.lstat(folder)
-    except OSError as err:
-        raise FileError(
-            f"cannot make folder {str(folder)!r}: {exception_text(err)}; check its rights"
-        ) from err
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
         raise FileError(
             f"{str(folder)!r} is not a private folder of this user: others could put something "
@@ -186,16 +171,13 @@ def exclusive_lock(path: Path) -> Iterator[None]:
     if path.name in ("", ".."):
         raise ConfigurationError(f"{str(path)!r} names no file; give a name in a folder")
     lock = path.with_name(f".{path.name[-200:]}.lock")
-    try:
-        held = _locked(lock)
-    except BlockingIOError as err:
-        raise ConfigurationError(
-            f"{str(path)!r} is in use by another process; end it, or give another name"
-        ) from err
-    except OSError as err:
-        raise FileError(
-            f"cannot hold {str(path)!r}: {exception_text(err)}; check its folder"
-        ) from err
+    with explained_errors(f"cannot hold {str(path)!r}", "check its folder", caught=OSError):
+        try:
+            held = _locked(lock)
+        except BlockingIOError as err:
+            raise ConfigurationError(
+                f"{str(path)!r} is in use by another process; end it, or give another name"
+            ) from err
     try:
         yield
     finally:

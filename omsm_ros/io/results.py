@@ -15,7 +15,14 @@ from omsm_ros.core.correction.surface_points import CLOUD_FIELDS, SurfacePoints,
 from omsm_ros.core.correction.systematic import ScanFields
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import CLOUD, SUMMARY, atomic_file, exception_text, open_regular, save_bytes
+from omsm_ros.io.files import (
+    CLOUD,
+    SUMMARY,
+    atomic_file,
+    explained_errors,
+    open_regular,
+    save_bytes,
+)
 from omsm_ros.io.folders import read_result
 from omsm_ros.io.json_and_yaml import (
     CONFORMITY,
@@ -299,10 +306,9 @@ def read_curves(path: Path) -> dict[str, Any]:
 
 
 def _numbers(values: object, what: str, axes: int) -> FloatArray:
-    try:
+    wrong = TypeError, ValueError
+    with explained_errors(f"{what} is no row of numbers", _REPEATED, caught=wrong):
         found = np.array(values, np.float64)
-    except (TypeError, ValueError) as err:
-        raise FileError(f"{what} is no row of numbers: {exception_text(err)}; {_REPEATED}") from err
     if found.ndim != axes or not found.size or not np.all(np.isfinite(found)):
         raise FileError(
             f"{what} has shape {found.shape!r} or values that are not finite; {_REPEATED}"
@@ -342,8 +348,8 @@ def load_fields(path: Path | str) -> ScanFields:
         raw = stream.read(MAX_BYTES + 1)
     if len(raw) > MAX_BYTES:
         raise FileError(f"{what} have more than {MAX_BYTES} bytes; correct the scan again")
-    try:
-        # numpy refuses pickles by default; a signalling NaN is refused below.
+    # numpy raises many kinds, and refuses pickles by default; a signalling NaN is refused below.
+    with explained_errors(f"{what} are damaged", "correct the scan again", caught=Exception):
         with np.load(io.BytesIO(raw)) as content, np.errstate(invalid="ignore"):
             names, fields, every = (np.asarray(content[name]) for name in _NAMES)
             # Without a statement, each field may be an upper bound.
@@ -353,10 +359,6 @@ def load_fields(path: Path | str) -> ScanFields:
                 raise ValueError("a field is complex, or its spacing is no single number")
             values = fields.astype(np.float64)
         found = ScanFields(_today(names), values, int(every), _today(bounds), _today(aligned))
-    except Exception as err:  # numpy raises many kinds
-        raise FileError(
-            f"{what} are damaged: {exception_text(err)}; correct the scan again"
-        ) from err
     shape = found.fields.shape
     if len(shape) != 2 or shape[0] != len(names) or found.every < 1:
         raise FileError(f"{what} have shape {shape!r} for {len(names)} names; correct it again")

@@ -67,7 +67,7 @@ def test_missing_topic_names_what_is_there(bag):
 def test_missing_cut_and_foreign_files_are_refused(tmp_path, bag):
     with pytest.raises(BagError, match="no bag at"):
         _open(tmp_path / "none", *TOPICS)
-    with pytest.raises(BagError, match="cannot be read"):
+    with pytest.raises(BagError, match="no rosbag2 bag"):
         _open(tmp_path, *TOPICS)
     whole = bag.read_bytes()
     for length in (0, 7, 1000, len(whole) // 2, len(whole) - 3):

@@ -4,8 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from omsm_ros.core.surface.measured_points import MeasuredPoints
-from omsm_ros.errors import DataError, FileError
-from omsm_ros.io.files import CLOUD, exception_text, open_regular
+from omsm_ros.errors import DataError, FileError, named_errors
+from omsm_ros.io.files import CLOUD, explained_errors, open_regular
 from omsm_ros.io.maps import instrument_files
 from omsm_ros.io.maps.columns_file import UTF_16, has_dabam_header, read_columns, read_dabam
 from omsm_ros.io.maps.grid_sag_file import is_grid_sag, read_grid_sag
@@ -31,14 +31,10 @@ def read_points(
     without this ``channel``.
     """
     file = path / CLOUD if path.is_dir() else path
-    try:
+    what = f"map {str(file)!r}"
+    unreadable = explained_errors(f"{what} cannot be read", "check the path", caught=OSError)
+    with named_errors(FileError, what, DataError), unreadable:
         return _read(file, units, channel)
-    except DataError as err:
-        raise FileError(f"map {str(file)!r}: {err}") from err
-    except OSError as err:
-        raise FileError(
-            f"map {str(file)!r} cannot be read: {exception_text(err)}; check the path"
-        ) from err
 
 
 def _head(path: Path) -> bytes:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import atomic_file, exception_text, open_regular
+from omsm_ros.io.files import atomic_file, explained_errors, open_regular
 from omsm_ros.io.tables.text_table import rows_in
 from omsm_ros.quantities import CLOUD_POINTS, shown
 from omsm_ros.units import NOT_USED, LengthUnits, needed
@@ -79,25 +79,19 @@ def _pcd_points(entries: Mapping[str, Sequence[str]], what: str) -> tuple[np.dty
         raise FileError(
             f"{what}: FIELDS, SIZE, TYPE and COUNT do not fit each other; write it again"
         )
-    try:
+    unknown = f"{what} has fields of unknown type"
+    with explained_errors(unknown, "write numbers", caught=(KeyError, ValueError)):
         fields = [
             (name, f"<{_PCD_KINDS[kind]}{int(size)}")
             for name, size, kind in zip(names, sizes, kinds, strict=True)
         ]
-    except (KeyError, ValueError) as err:
-        raise FileError(
-            f"{what} has fields of unknown type: {exception_text(err)}; write numbers"
-        ) from err
     return _dtype(fields, what), _count(entries.get("POINTS", []), what)
 
 
 def _dtype(fields: list[tuple[str, str]], what: str) -> np.dtype[np.void]:
-    try:
+    wrong = f"{what} has fields that cannot be read"
+    with explained_errors(wrong, "name each once", caught=(TypeError, ValueError)):
         dtype = np.dtype(fields)
-    except (TypeError, ValueError) as err:
-        raise FileError(
-            f"{what} has fields that cannot be read: {exception_text(err)}; name each once"
-        ) from err
     if not {"x", "y"} <= set(dtype.names or ()) or not {"z", "height"} & set(dtype.names or ()):
         raise FileError(f"{what} has the fields {shown(dtype.names)}, expected x, y and z")
     return dtype
