@@ -30,14 +30,13 @@ def inspect_bag(path: AnyBag) -> Facts:
     topics: messages and samples of each; ``gaps`` of the trigger counter with the ``missing``
     samples; ``restarts`` of the counter; ``invalid`` readings of the probe or axes
     """
-    with Recording(path) as recording:
-        bag = recording.bag
+    with Recording(path) as bag:
         topics = bag.topics()
         present = [t.role for t in topics if t.role in bags.BLOCK_TOPICS and t.messages]
         watches = {topic: StreamWatch() for topic in present}
-        for topic, block in recording.stream(*present):
+        for topic, block in bag.stream(*present):
             watches[topic].add(block)
-        if recording.holds(bags.ACCELERATION_TOPIC):
+        if bag.holds(bags.ACCELERATION_TOPIC):
             watches[bags.ACCELERATION_TOPIC] = StreamWatch()
             for topic, block in bag.records(bags.ACCELERATION_TOPIC):
                 watches[topic].add(block)

@@ -16,7 +16,7 @@ from itertools import groupby
 from pathlib import Path
 from struct import error as struct_error
 from struct import unpack_from
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,6 +163,7 @@ _BYTES = bytes | memoryview
 _CLOCK_SET_NS = 946_684_800 * 10**9
 
 Item: TypeAlias = "tuple[str, Any]"
+_Opened = TypeVar("_Opened", bound="BagReader")
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +199,7 @@ class BagReader:
         self._cell = bag if isinstance(bag, CellBag) else CellBag(Path(bag))
         self.path = self._cell.path
 
-    def __enter__(self) -> BagReader:
+    def __enter__(self: _Opened) -> _Opened:
         whole = (
             "expected a rosbag2 folder or an .mcap file; if its recording was cut short, save what "
             "is whole with 'omsm inspect --repair'"

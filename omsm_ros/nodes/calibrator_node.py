@@ -280,7 +280,8 @@ def _identify_bag(
     with Recording(bag) as recording:
         motion = recording.motion(duration=duration, time_lapse=time_lapse, trigger=trigger)
         settings = recording.settings(stated)
-    options = {**options, "settings": settings, "origin": _origin(recording.recorded_ns)}
+        origin = _origin(recording.recorded_ns)
+    options = {**options, "settings": settings, "origin": origin}
     return _identified(motion, options, progress)
 
 

@@ -116,12 +116,12 @@ class CorrectedScan:
         )
         self._rest = chain([first], blocks)
         self.recorded_ns = recording.recorded_ns
-        self.temperatures = recording.bag.temperatures()
+        self.temperatures = recording.temperatures()
         self.reasons = objections(
             calibration,
             sample_period=self.sample_period,
             settings=admission.settings,
-            probe=recording.bag.probe_settings(),
+            probe=recording.probe_settings(),
             polarity=options.polarity,
         )
         self.admitted = admit(calibration, self.reasons, admission.override)

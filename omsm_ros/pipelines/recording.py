@@ -29,49 +29,32 @@ MAX_PATH_SAMPLES = 2**20
 SCAN_TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 
 
-class Recording:
-    """A bag opened for one task; use it as a context manager.
-
-    bag: its reader, for what only one task needs;  recorded_ns: when the recording began
-        [ns, ROS time], None if its clock was never set
-
-    Raises BagError for a path that is no bag.
-    """
-
-    def __init__(self, path: AnyBag) -> None:
-        self.path, self.bag = path, bags.BagReader(path)
-
-    def __enter__(self) -> Recording:
-        self.bag.__enter__()
-        self.recorded_ns = self.bag.recorded_ns
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.bag.__exit__(*error)
+class Recording(bags.BagReader):
+    """A bag opened for one task, whose progress it states; use it as a context manager."""
 
     def holds(self, topic: str) -> bool:
         """Return True if there are messages on ``topic``."""
-        return self.bag.count([topic]) > 0
+        return self.count([topic]) > 0
 
     def stream(self, *topics: str) -> Iterator[tuple[str, Any]]:
         """Yield ``(topic, block)`` in the order of recording, short blocks joined."""
-        total = self.bag.count(topics)
-        for done, topic, block in self.bag.blocks(*topics):
+        total = self.count(topics)
+        for done, topic, block in self.blocks(*topics):
             yield topic, block
             state_progress(done, total)
 
-    def blocks(self, *topics: str) -> dict[str, list[Block]]:
+    def recorded(self, *topics: str) -> dict[str, list[Block]]:
         """Return all blocks by topic, as they were recorded; BagError if a topic is absent."""
         found: dict[str, list[Block]] = {topic: [] for topic in topics}
-        total = self.bag.count(topics)
-        for done, (topic, block) in enumerate(self.bag.records(*topics), start=1):
+        total = self.count(topics)
+        for done, (topic, block) in enumerate(self.records(*topics), start=1):
             found[topic].append(block)
             state_progress(done, total)
         return found
 
     def sample_period(self) -> float:
         """Return the sample period of the probe [s]; BagError without samples of it."""
-        for _, block in self.bag.records(bags.DISTANCE_TOPIC):
+        for _, block in self.records(bags.DISTANCE_TOPIC):
             return float(block.sample_period)
         raise BagError(
             f"{str(self.path)!r} has no samples on {bags.DISTANCE_TOPIC!r}; record a scan"
@@ -84,13 +67,13 @@ class Recording:
             reader.add(block)
         found = reader.path()
         if found is None:
-            name = self.bag.name_of(bags.AXES_TOPIC)
+            name = self.name_of(bags.AXES_TOPIC)
             raise BagError(f"{str(self.path)!r} has no position of Z on {name!r}; record a motion")
         return found
 
     def settings(self, stated: Mapping[str, object]) -> dict[str, object]:
         """Return the settings of a calibration from this bag: ``stated``, and the probe's own."""
-        return settings_with(stated, self.bag.probe_settings())
+        return settings_with(stated, self.probe_settings())
 
     def motion(
         self,
@@ -113,7 +96,7 @@ class Recording:
         """
         faster = TIME_LAPSE.checked(time_lapse, ConfigurationError, "time_lapse")
         topics = [*SCAN_TOPICS, *filter(self.holds, [bags.REFERENCE_TOPIC])]
-        blocks = self.blocks(*topics)
+        blocks = self.recorded(*topics)
         if not all(blocks[topic] for topic in SCAN_TOPICS):
             raise BagError(
                 f"{str(self.path)!r} has its topics but no samples on them; record a step test"

@@ -158,7 +158,7 @@ def _read(path: AnyBag, name: str, options: SpectrumOptions) -> ReadScan:
         account, period = scan.account.as_dict(), scan.sample_period
         shaken = []
         if recording.holds(bags.ACCELERATION_TOPIC):
-            shaken = [block for _, block in recording.bag.records(bags.ACCELERATION_TOPIC)]
+            shaken = [block for _, block in recording.records(bags.ACCELERATION_TOPIC)]
     every = join_points(parts)
     points = every.part(slice(0, MOST_SAMPLES))
     height = points.height

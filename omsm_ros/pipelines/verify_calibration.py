@@ -67,7 +67,7 @@ def established_offset(path: AnyBag, calibration: Calibration) -> CounterOffset:
     the motion does not determine the offset.
     """
     with Recording(path) as recording:
-        blocks = recording.blocks(*SCAN_TOPICS)
+        blocks = recording.recorded(*SCAN_TOPICS)
     return offset_in(path, blocks, calibration)
 
 

@@ -23,7 +23,7 @@ class Importer:
 
     def blocks(self, topic=bags.DISTANCE_TOPIC):
         with Recording(self.out) as recording:
-            return recording.blocks(topic)[topic]
+            return recording.recorded(topic)[topic]
 
 
 @pytest.fixture

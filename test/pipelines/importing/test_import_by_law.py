@@ -29,7 +29,7 @@ def imported(folder, mapping, text, name="t.csv"):
     out = folder / "out.mcap"
     import_recording([folder / name], mapped, form, out)
     with Recording(out) as recording:
-        return recording.blocks(*(one.role for one in recording.bag.topics()))
+        return recording.recorded(*(one.role for one in recording.topics()))
 
 
 @FEW

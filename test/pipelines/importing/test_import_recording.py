@@ -71,8 +71,8 @@ def test_a_bag_that_exists_is_refused_and_stays(tmp_path):
 def blocks_in(path):
     """Return the blocks of a bag by topic, axes first."""
     with Recording(path) as recording:
-        topics = sorted(topic.role for topic in recording.bag.topics())
-        return recording.blocks(*topics)
+        topics = sorted(topic.role for topic in recording.topics())
+        return recording.recorded(*topics)
 
 
 def samples_of(bag):
