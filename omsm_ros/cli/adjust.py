@@ -3,7 +3,7 @@
 import argparse
 
 from omsm_ros.cli.arguments import Arguments, cell_of
-from omsm_ros.cli.command import CliCommand, Facts, table, written
+from omsm_ros.cli.command import CliCommand, Facts, Rows, written
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_geometry, load_sources, load_surface
@@ -60,23 +60,21 @@ def _adjust(args: argparse.Namespace) -> Facts:
     return {**facts, "out": str(args.out)}
 
 
-def _show(facts: Facts) -> None:
+def _show(facts: Facts) -> Rows:
     # Here, because the page's module loads what draws.
     from omsm_ros.report.adjustment import source_table, tested_text
 
-    table(
-        [
-            ("result", headline(facts)),
-            ("verdict", facts["verdict"]["text"]),
-            *(("", text) for text in next_steps(facts["verdict"])),
-            *((name, f"{'' if declared.startswith('not') else 'declared '}{declared}, "
-               f"{'' if found.startswith('not') else 'found '}{found}"
-               + (f": {status}" if status else ""))
-              for name, declared, found, _, status in source_table(facts).rows),
-            ("", tested_text(facts)),
-            written(facts["files"].values(), facts["out"]),
-        ]
-    )  # fmt: skip
+    return [
+        ("result", headline(facts)),
+        ("verdict", facts["verdict"]["text"]),
+        *(("", text) for text in next_steps(facts["verdict"])),
+        *((name, f"{'' if declared.startswith('not') else 'declared '}{declared}, "
+           f"{'' if found.startswith('not') else 'found '}{found}"
+           + (f": {status}" if status else ""))
+          for name, declared, found, _, status in source_table(facts).rows),
+        ("", tested_text(facts)),
+        written(facts["files"].values(), facts["out"]),
+    ]  # fmt: skip
 
 
 COMMANDS = (CliCommand("adjust", _declare, _adjust, _show),)

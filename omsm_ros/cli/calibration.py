@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from omsm_ros.cli.arguments import TRIGGER, Arguments, cell_of, number, trigger_of
-from omsm_ros.cli.command import CliCommand, Facts, kept, rejected, say, say_lines, table, written
+from omsm_ros.cli.command import CliCommand, Facts, Rows, kept, rejected, say, say_lines, written
 from omsm_ros.core.calibration.calibration_set import calibration_set
 from omsm_ros.core.calibration.repeatability import (
     CalibrationChange,
@@ -156,19 +156,17 @@ def _calset(args: argparse.Namespace) -> Facts:
     }
 
 
-def _show_calset(facts: Facts) -> None:
+def _show_calset(facts: Facts) -> Rows:
     unit = "rad" if facts["along"] == "b" else "m"
-    table(
-        [
-            *(
-                (f"at {facts['along']} = {quantity(place, unit)}", f"lag {quantity(lag, 's', 4)}")
-                for place, lag in zip(facts["positions"], facts["lags"], strict=True)
-            ),
-            ("valid up to", quantity(facts["valid_up_to"], "Hz")),
-            ("verdict", facts["verdict"] or "none"),
-            written([facts["calibration"]]),
-        ]
-    )
+    return [
+        *(
+            (f"at {facts['along']} = {quantity(place, unit)}", f"lag {quantity(lag, 's', 4)}")
+            for place, lag in zip(facts["positions"], facts["lags"], strict=True)
+        ),
+        ("valid up to", quantity(facts["valid_up_to"], "Hz")),
+        ("verdict", facts["verdict"] or "none"),
+        written([facts["calibration"]]),
+    ]
 
 
 COMMANDS = (

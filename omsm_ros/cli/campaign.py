@@ -16,7 +16,7 @@ from urllib.parse import quote, urlsplit
 
 from omsm_ros import __version__
 from omsm_ros.cli.arguments import ADDRESS, Arguments
-from omsm_ros.cli.command import CliCommand, Facts, say, table, written
+from omsm_ros.cli.command import CliCommand, Facts, Rows, say, written
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.files import (
@@ -332,13 +332,13 @@ def _link(out: Path, entry: Entry) -> str:
     return quote(page) if (out / page).exists() else ""
 
 
-def _show_batch(facts: Facts) -> None:
+def _show_batch(facts: Facts) -> Rows:
     for entry in facts["entries"]:
         if entry["state"] != DONE:
             say(f"{entry['bag']}: {entry['state']}, {entry['said']}")
     done = sum(entry["state"] == DONE for entry in facts["entries"])
     say(f"{done} of {len(facts['entries'])} bags are done")
-    table([written([_INDEX], facts["out"])])
+    return [written([_INDEX], facts["out"])]
 
 
 def _undone(facts: Facts) -> str:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from omsm_ros.core.calibration.calibration import Calibration
 
 Facts: TypeAlias = dict[str, Any]
+Rows: TypeAlias = list[tuple[str, str]]
 LIMIT = "{value:{unit}} of {allowed:{unit}}"
 """Template of a limit of a motion."""
 
@@ -27,14 +28,14 @@ class CliCommand:
     """One command of ``omsm``; its task and its line of help are in ``words``.
 
     declare: adds its arguments;  act: runs it and returns facts in SI units for ``--json``
-    show: prints the facts as text
+    show: prints the facts as text, and returns rows of names and texts to print after that
     refusal: returns why the command failed although it returned facts; empty if it did not
     """
 
     name: str
     declare: Callable[[Arguments], None]
     act: Callable[[argparse.Namespace], Facts]
-    show: Callable[[Facts], None]
+    show: Callable[[Facts], Rows | None]
     refusal: Callable[[Facts], str] = lambda facts: ""
 
 
@@ -91,7 +92,7 @@ def written(files: Iterable[str], folder: str = "") -> tuple[str, str]:
     return "written", f"{names} in {folder}" if folder else names
 
 
-def table(rows: list[tuple[str, str]]) -> None:
+def table(rows: Rows) -> None:
     """Print names and values in two columns; nothing without rows."""
     width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:

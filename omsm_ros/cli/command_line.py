@@ -376,7 +376,7 @@ def _tell(args: argparse.Namespace, facts: Facts) -> None:
         if args.json:
             print(json_and_yaml.text_of(json_and_yaml.unknown_as_null(facts)))
         else:
-            args.run.show(facts)
+            table(args.run.show(facts) or [])
         sys.stdout.flush()
     except OSError as err:
         if isinstance(err, BrokenPipeError) or err.filename is not None:

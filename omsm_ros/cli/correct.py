@@ -13,7 +13,7 @@ from omsm_ros.cli.arguments import (
     refuse_cell,
     trigger_of,
 )
-from omsm_ros.cli.command import LIMIT, CliCommand, Facts, table, written
+from omsm_ros.cli.command import LIMIT, CliCommand, Facts, Rows, written
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows, registration_of
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
@@ -128,7 +128,7 @@ def _correct(args: argparse.Namespace) -> Facts:
     return {**summary, "warnings": warnings, "out": str(args.out)}
 
 
-def _show_correct(summary: Facts) -> None:
+def _show_correct(summary: Facts) -> Rows:
     rows = []
     for stream, account in summary["samples"].items():
         reasons = "".join(f", {count} {name}" for name, count in account["counted"].items())
@@ -144,7 +144,7 @@ def _show_correct(summary: Facts) -> None:
     rows += [("warning", text) for text in summary.get("warnings", [])]
     if "form" in summary:
         rows += form_rows(summary["form"], summary.get("figures"))
-    table([*rows, written(summary["files"].values(), summary["out"])])
+    return [*rows, written(summary["files"].values(), summary["out"])]
 
 
 def _declare_predict(add: Arguments) -> None:
@@ -170,20 +170,18 @@ _PREDICTED = {
 }
 
 
-def _show_predict(facts: Facts) -> None:
-    table(
-        [
-            ("verdict", "safe" if facts["safe"] else "NOT safe"),
-            *rows_from(facts, _PREDICTED),
-            ("maximum speed", f"{_times(facts['speed_factor'])} this motion, limited by "
-                              f"{facts['binding']}"),
-            *((f"  limit: {one['name']}", text_from(LIMIT, one)
-               + f", maximum speed {_times(one['speed_factor'])}") for one in facts["limits"]),
-            ("not evaluated", ", ".join(facts["not_evaluated"]) or "nothing"),
-            *((name, facts[key]) for name, key in (("not judged", "left_out"), ("advice", "advice"))
-              if facts[key]),
-        ]
-    )  # fmt: skip
+def _show_predict(facts: Facts) -> Rows:
+    return [
+        ("verdict", "safe" if facts["safe"] else "NOT safe"),
+        *rows_from(facts, _PREDICTED),
+        ("maximum speed", f"{_times(facts['speed_factor'])} this motion, limited by "
+                          f"{facts['binding']}"),
+        *((f"  limit: {one['name']}", text_from(LIMIT, one)
+           + f", maximum speed {_times(one['speed_factor'])}") for one in facts["limits"]),
+        ("not evaluated", ", ".join(facts["not_evaluated"]) or "nothing"),
+        *((name, facts[key]) for name, key in (("not judged", "left_out"), ("advice", "advice"))
+          if facts[key]),
+    ]  # fmt: skip
 
 
 def _times(factor: float) -> str:
@@ -230,7 +228,7 @@ def _align(args: argparse.Namespace) -> Facts:
     }
 
 
-def _show_align(facts: Facts) -> None:
+def _show_align(facts: Facts) -> Rows:
     rows = []
     for name, spread in facts["uncertainty"].items():
         value, length = facts["geometry"][name], name.startswith("centre")
@@ -243,7 +241,7 @@ def _show_align(facts: Facts) -> None:
     rows += [("warning", warning) for warning in facts["warnings"]]
     corrected = facts["samples"]["axes"]["corrected"]
     rows.append(("points", f"{corrected} corrected, {facts['used']} of them fitted"))
-    table([*rows, written([facts["file"]])])
+    return [*rows, written([facts["file"]])]
 
 
 def _declare_report(add: Arguments) -> None:
@@ -265,7 +263,5 @@ COMMANDS = (
     CliCommand("predict", _declare_predict, _predict, _show_predict),
     CliCommand("correct", _declare_correct, _correct, _show_correct),
     CliCommand("align", _declare_align, _align, _show_align),
-    CliCommand(
-        "report", _declare_report, _report, lambda facts: table([written([facts["report"]])])
-    ),
+    CliCommand("report", _declare_report, _report, lambda facts: [written([facts["report"]])]),
 )

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from omsm_ros.cli.arguments import Arguments, values_of
-from omsm_ros.cli.command import CliCommand, Facts, table, written
+from omsm_ros.cli.command import CliCommand, Facts, Rows, written
 from omsm_ros.core.comparison.matching import MATCHING_PARAMETERS, SEATED, ordered_dofs
 from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.errors import ConfigurationError
@@ -74,7 +74,7 @@ _GRID = (
 )
 
 
-def _show_difference(facts: Facts) -> None:
+def _show_difference(facts: Facts) -> Rows:
     found = facts["difference"]
     rows = [("verdict", facts["verdict"])]
     rows += [("because", text) for text in facts["reasons"]]
@@ -93,7 +93,7 @@ def _show_difference(facts: Facts) -> None:
         rows.append(("points", text_from("|E_n| < 1 on {within:%/3} of the area", facts)))
     for name in ("a", "b"):
         rows += [(f"note on {name.upper()}", text) for text in facts[name]["notes"]]
-    table([*rows, written(facts["files"].values(), facts["out"])])
+    return [*rows, written(facts["files"].values(), facts["out"])]
 
 
 COMMANDS = (CliCommand("difference", _declare_difference, _difference, _show_difference),)

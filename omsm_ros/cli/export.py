@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omsm_ros.cli.arguments import Arguments
-from omsm_ros.cli.command import CliCommand, Facts, table, written
+from omsm_ros.cli.command import CliCommand, Facts, Rows, written
 from omsm_ros.core.comparison.resampling import on_grid
 from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
@@ -144,11 +144,11 @@ _OF_MAP = {
 }
 
 
-def _show_export(facts: Facts) -> None:
+def _show_export(facts: Facts) -> Rows:
     rows = [("points", count(facts["points"]))]
     if "resampling" in facts:
         rows += rows_from(facts, _OF_MAP)
-    table([*rows, written([facts["file"]])])
+    return [*rows, written([facts["file"]])]
 
 
 COMMANDS = (CliCommand("export", _declare_export, _export, _show_export),)

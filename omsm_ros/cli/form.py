@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.cli.arguments import Arguments, cell_of, refuse_cell
-from omsm_ros.cli.command import LIMIT, CliCommand, Facts, table, written
+from omsm_ros.cli.command import LIMIT, CliCommand, Facts, Rows, written
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows, registration_of
 from omsm_ros.core.form.analyse import FormResult
 from omsm_ros.core.form.compensation import (
@@ -225,7 +225,7 @@ def _form(args: argparse.Namespace) -> Facts:
     return {**facts, "out": str(args.out)}
 
 
-def _show_form(facts: Facts) -> None:
+def _show_form(facts: Facts) -> Rows:
     verdict = []
     if held := facts.get("conformity"):
         verdict = [("tolerance", f"{held['verdict']}, {quantity(held['tolerance'], 'm')}")]
@@ -234,10 +234,10 @@ def _show_form(facts: Facts) -> None:
         verdict = [("open", o["reason"]) for o in facts["open"] if o["peak_to_valley"] is not None]
     verdict += _drawing_rows(facts.get("drawing"))
     files = [FORM, CURVES, DEVIATION, *([facts["report"]] if "report" in facts else [])]
-    table([*verdict, *form_rows(facts), written(files, facts["out"])])
+    return [*verdict, *form_rows(facts), written(files, facts["out"])]
 
 
-def _drawing_rows(found: Facts | None) -> list[tuple[str, str]]:
+def _drawing_rows(found: Facts | None) -> Rows:
     if not found:
         return []
     spacing = found["fringe_spacing"]
@@ -324,7 +324,7 @@ def _write_cut(form: FormResult, args: argparse.Namespace, out: Path) -> Facts:
     }
 
 
-def _show_compensate(facts: Facts) -> None:
+def _show_compensate(facts: Facts) -> Rows:
     lengths = ("rms_before", "rms_after", "largest_offset", "largest_uncertainty", "low_pass")
     rows = [(name.replace("_", " "), quantity(facts[name], "m")) for name in lengths]
     rows += [("warning", text) for text in facts["warnings"]]
@@ -339,7 +339,7 @@ def _show_compensate(facts: Facts) -> None:
         files.append(facts["cut"])
     if facts["last_cut"] is not None:
         rows.append(("effect of the last cut", f"{facts['last_cut']:.2f} of what was asked for"))
-    table([*rows, ("sign", facts["sign"]), written(files, facts["out"])])
+    return [*rows, ("sign", facts["sign"]), written(files, facts["out"])]
 
 
 def _declare_surface(add: Arguments) -> None:
@@ -363,21 +363,19 @@ def _surface(args: argparse.Namespace) -> Facts:
 _FOLLOWS = {True: "can follow", False: "CANNOT follow", None: "not evaluated"}
 
 
-def _show_surface(facts: Facts) -> None:
+def _show_surface(facts: Facts) -> Rows:
     degrees = plain(facts["steepest_angle"] / DEGREE_RAD)
     at = text_from("x = {steepest_at[0]:m}, y = {steepest_at[1]:m}", facts)
     drawn = [written([facts["figure"]], facts["out"])] if "figure" in facts else []
-    table(
-        [
-            ("peak to valley", quantity(facts["peak_to_valley"], "m")),
-            ("steepest", f"{degrees}° at {at}"),
-            ("probe", _FOLLOWS[facts["probe_can_follow"]]),
-            ("axes", _FOLLOWS[facts["axes_can_follow"]]),
-            *((f"  {limit['name']}", text_from(LIMIT, limit)) for limit in facts["limits"]),
-            ("not evaluated", ", ".join(facts["not_evaluated"])),
-            *drawn,
-        ]
-    )
+    return [
+        ("peak to valley", quantity(facts["peak_to_valley"], "m")),
+        ("steepest", f"{degrees}° at {at}"),
+        ("probe", _FOLLOWS[facts["probe_can_follow"]]),
+        ("axes", _FOLLOWS[facts["axes_can_follow"]]),
+        *((f"  {limit['name']}", text_from(LIMIT, limit)) for limit in facts["limits"]),
+        ("not evaluated", ", ".join(facts["not_evaluated"])),
+        *drawn,
+    ]
 
 
 COMMANDS = (

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from omsm_ros.cli.arguments import Arguments
-from omsm_ros.cli.command import CliCommand, Facts, say, table, written
+from omsm_ros.cli.command import CliCommand, Facts, Rows, say, table, written
 from omsm_ros.core.calibration.repeatability import LinearTrend
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.json_and_yaml import unknown_as_null
@@ -69,7 +69,7 @@ def _with_times_as_text(machine: Facts) -> Facts | None:
     return unknown_as_null(machine)
 
 
-def _show_history(facts: Facts) -> None:
+def _show_history(facts: Facts) -> Rows:
     if not facts["machines"]:
         say(f"{facts['catalogue']} is empty; add to it with --add, or with --catalogue")
     for machine in facts["machines"]:
@@ -99,8 +99,7 @@ def _show_history(facts: Facts) -> None:
             f"{count(facts['older'])} older calibrations and measurements are neither listed nor "
             "in the drifts; --machine lists one machine"
         )
-    if "figure" in facts:
-        table([written([facts["figure"]])])
+    return [written([facts["figure"]])] if "figure" in facts else []
 
 
 def _when(row: dict[str, Any]) -> str:

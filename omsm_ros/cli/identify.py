@@ -19,7 +19,7 @@ from omsm_ros.cli.arguments import (
     refuse_cell,
     trigger_of,
 )
-from omsm_ros.cli.command import CliCommand, Facts, kept, output_path_for, rejected, table, written
+from omsm_ros.cli.command import CliCommand, Facts, Rows, kept, output_path_for, rejected, written
 from omsm_ros.core.calibration.calibration import FURTHER_AXES, Calibration
 from omsm_ros.core.calibration.certificate import NOTE, Origin, from_json, of_severity
 from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse, use_of_motion
@@ -332,7 +332,7 @@ _RISES = (
 )
 
 
-def _show(facts: Facts) -> None:
+def _show(facts: Facts) -> Rows:
     rows = [("verdict", facts["verdict"]), ("order", str(facts["order"]))]
     if "model" in facts:
         rows += [
@@ -366,7 +366,7 @@ def _show(facts: Facts) -> None:
     rows.append(written([facts.get("calibration") or facts["model"]]))
     if "report" in facts:
         rows.append(("certificate", facts["report"]))
-    table(rows)
+    return rows
 
 
 def _declare_validate(add: Arguments) -> None:
@@ -403,14 +403,14 @@ def _validate(args: argparse.Namespace) -> Facts:
     return facts
 
 
-def _show_validate(facts: Facts) -> None:
+def _show_validate(facts: Facts) -> Rows:
     rows = [
         ("model", facts["model_verdict"] or "no verdict"),
         ("simulation fit", f"{percent(facts['explained'], 4)} of the output"),
         ("residual, rms", f"{plain(facts['residual_rms'], 4)} in units of the output"),
         ("samples", count(facts["samples"])),
     ]
-    table([*rows, *((name, facts[name]) for name in ("run", "report") if name in facts)])
+    return [*rows, *((name, facts[name]) for name in ("run", "report") if name in facts)]
 
 
 COMMANDS = (

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from omsm_ros.cli.arguments import Arguments, cell_of, json_object
-from omsm_ros.cli.command import CliCommand, Facts, kept, rejected, table, written
+from omsm_ros.cli.command import CliCommand, Facts, Rows, kept, rejected, written
 from omsm_ros.core.adjustment.resolved_calibration import (
     after_step_test,
     from_scans_alone,
@@ -95,25 +95,23 @@ def _resolved_facts(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def _show_selfcal(facts: Facts) -> None:
-    table(
-        [
-            ("verdict", facts["verdict"]),
-            *(("reason", text) for text in facts["reasons"]),
-            ("scans", ", ".join(f"{speed:.1f} rpm" for speed in facts["speeds_rpm"])),
-            ("lag of Z", standard(facts["lag"], facts["lag_uncertainty"], "s")),
-            *_latency_rows(facts["latency"]),
-            ("valid up to", quantity(facts["valid_up_to"], "Hz")),
-            ("residual error", f"{quantity(facts['left_on_this_surface'], 'm')} rms on this "
-                               "surface (k = 1)"),
-            ("scans differ by", f"{quantity(facts['disagreement'], 'm')} rms beyond noise"),
-            *(("not identifiable", text) for text in facts["unidentifiable"]),
-            written([facts["calibration"]]),
-        ]
-    )  # fmt: skip
+def _show_selfcal(facts: Facts) -> Rows:
+    return [
+        ("verdict", facts["verdict"]),
+        *(("reason", text) for text in facts["reasons"]),
+        ("scans", ", ".join(f"{speed:.1f} rpm" for speed in facts["speeds_rpm"])),
+        ("lag of Z", standard(facts["lag"], facts["lag_uncertainty"], "s")),
+        *_latency_rows(facts["latency"]),
+        ("valid up to", quantity(facts["valid_up_to"], "Hz")),
+        ("residual error", f"{quantity(facts['left_on_this_surface'], 'm')} rms on this "
+                           "surface (k = 1)"),
+        ("scans differ by", f"{quantity(facts['disagreement'], 'm')} rms beyond noise"),
+        *(("not identifiable", text) for text in facts["unidentifiable"]),
+        written([facts["calibration"]]),
+    ]  # fmt: skip
 
 
-def _latency_rows(latency: Facts) -> list[tuple[str, str]]:
+def _latency_rows(latency: Facts) -> Rows:
     share = latency["share"]
     return [
         ("probe latency", standard(latency["delay_s"], latency["uncertainty_s"], "s")),
@@ -151,17 +149,15 @@ _MEANINGS = {
 }
 
 
-def _show_reversal(facts: Facts) -> None:
-    table(
-        [
-            ("probe latency", standard(facts["lag"], facts["uncertainty"], "s")),
-            ("lag of Z", quantity(facts["lag_of_z"], "s", 4)),
-            ("meaning", _MEANINGS[facts["latency"]]),
-            ("residual", f"{quantity(facts['residual'], 'm')} rms"),
-            ("points", f"{facts['points']} corrected, {facts['used']} of them fitted"),
-            written([facts.get("calibration", "nowhere; give --out to use it")]),
-        ]
-    )
+def _show_reversal(facts: Facts) -> Rows:
+    return [
+        ("probe latency", standard(facts["lag"], facts["uncertainty"], "s")),
+        ("lag of Z", quantity(facts["lag_of_z"], "s", 4)),
+        ("meaning", _MEANINGS[facts["latency"]]),
+        ("residual", f"{quantity(facts['residual'], 'm')} rms"),
+        ("points", f"{facts['points']} corrected, {facts['used']} of them fitted"),
+        written([facts.get("calibration", "nowhere; give --out to use it")]),
+    ]
 
 
 def _declare_latency(add: Arguments) -> None:
@@ -183,14 +179,12 @@ def _latency(args: argparse.Namespace) -> Facts:
     return {**_resolved_facts(made), "calibration": str(path)}
 
 
-def _show_latency(facts: Facts) -> None:
-    table(
-        [
-            ("lag of Z", standard(facts["lag"], facts["lag_uncertainty"], "s")),
-            *_latency_rows(facts["latency"]),
-            written([facts["calibration"]]),
-        ]
-    )
+def _show_latency(facts: Facts) -> Rows:
+    return [
+        ("lag of Z", standard(facts["lag"], facts["lag_uncertainty"], "s")),
+        *_latency_rows(facts["latency"]),
+        written([facts["calibration"]]),
+    ]
 
 
 COMMANDS = (

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.cli.arguments import Arguments, values_of
-from omsm_ros.cli.command import CliCommand, Facts, say, table, written
+from omsm_ros.cli.command import CliCommand, Facts, Rows, say, written
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.kinematics.limits import KnownOfMachine, choose_motion, harmonic_orders, margins
 from omsm_ros.core.kinematics.trajectories import (
@@ -119,23 +119,19 @@ def _lengths(lengths: Sequence[float]) -> str:
     return " and ".join(quantity(length, "m") for length in lengths)
 
 
-def _show_plan(facts: Facts) -> None:
+def _show_plan(facts: Facts) -> Rows:
     if "sets" in facts or "motion" in facts:
-        _show_scans(facts) if "sets" in facts else _show_motion(facts)
-        return
+        return _show_scans(facts) if "sets" in facts else _show_motion(facts)
     if "lines" in facts:
         rows = [("travel", _lengths([facts["travel"]])), ("duration", f"{facts['duration']:.0f} s")]
-        table([("lines", str(facts["lines"])), *rows, written(facts["files"].values())])
-        return
-    table(
-        [
-            ("edges", f"{facts['edges']} of {_lengths(facts['heights'])}"),
-            ("travel", _lengths([facts["travel"]])),
-            ("duration", quantity(facts["duration"], "s")),
-            ("rise", f"{quantity(facts['rise'], 's')}, dithered within the sample period"),
-            written(facts["files"].values()),
-        ]
-    )
+        return [("lines", str(facts["lines"])), *rows, written(facts["files"].values())]
+    return [
+        ("edges", f"{facts['edges']} of {_lengths(facts['heights'])}"),
+        ("travel", _lengths([facts["travel"]])),
+        ("duration", quantity(facts["duration"], "s")),
+        ("rise", f"{quantity(facts['rise'], 's')}, dithered within the sample period"),
+        written(facts["files"].values()),
+    ]
 
 
 def _radius(args: argparse.Namespace, nominal: Surface) -> float:
@@ -192,7 +188,7 @@ def _plan_motion(args: argparse.Namespace) -> Facts:
     }
 
 
-def _show_motion(facts: Facts) -> None:
+def _show_motion(facts: Facts) -> Rows:
     names = {
         "harmonic": "harmonic of Z to a mode: {:.3g} half-widths",
         "image": "alias of a vibration to a mode: {:.3g} half-widths",
@@ -211,13 +207,11 @@ def _show_motion(facts: Facts) -> None:
     if proposed["score"] < 1:
         say("no speed or feed within 20 % keeps all apart; give another --rate, --rpm or --feed")
     (path,) = facts["paths"]
-    table(
-        [
-            ("duration", quantity(facts["duration"], "s")),
-            ("scan_1.nc", _path_text(path, facts["path_error"])),
-            written(facts["files"]),
-        ]
-    )
+    return [
+        ("duration", quantity(facts["duration"], "s")),
+        ("scan_1.nc", _path_text(path, facts["path_error"])),
+        written(facts["files"]),
+    ]
 
 
 def _nominal(args: argparse.Namespace) -> Surface:
@@ -241,7 +235,7 @@ def _path_text(path: Mapping[str, float], bound: float) -> str:
     return f"Z within {error}{kept}; segments of {segment}; allow C {allowed:.0f} °/s²{points}"
 
 
-def _show_scans(facts: Facts) -> None:
+def _show_scans(facts: Facts) -> Rows:
     rows = []
     for one in facts["sets"]:
         scans = ", ".join(map(_scan_text, one["scans"]))
@@ -255,18 +249,13 @@ def _show_scans(facts: Facts) -> None:
         )
     bound = facts["path_error"]
     reached = "reaches" if facts["reaches"] else "does not reach"
-    table(
-        [
-            *rows,
-            *(
-                (f"scan_{k + 1}.nc", _path_text(path, bound))
-                for k, path in enumerate(facts["paths"])
-            ),
-            ("chosen", f"{facts['set']}, which {reached} {quantity(facts['accuracy'], 'm', 2)}"),
-            *([("", facts["largest"])] if facts["largest"] else ()),
-            written(facts["files"]),
-        ]
-    )
+    return [
+        *rows,
+        *((f"scan_{k + 1}.nc", _path_text(path, bound)) for k, path in enumerate(facts["paths"])),
+        ("chosen", f"{facts['set']}, which {reached} {quantity(facts['accuracy'], 'm', 2)}"),
+        *([("", facts["largest"])] if facts["largest"] else ()),
+        written(facts["files"]),
+    ]
 
 
 _PLANS = {

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from typing import Any
 
 from omsm_ros.cli.arguments import Arguments, cell_of
-from omsm_ros.cli.command import CliCommand, Facts, say, table, warn, written
+from omsm_ros.cli.command import CliCommand, Facts, Rows, say, warn, written
 from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import bags
@@ -113,14 +113,13 @@ def _inspect(args: argparse.Namespace) -> Facts:
     }
 
 
-def _show_inspect(facts: Facts) -> None:
+def _show_inspect(facts: Facts) -> Rows:
     if "repaired" in facts:
         saved = [(topic, f"{count} messages saved") for topic, count in facts["messages"].items()]
         lost = [("lost", text) for text in facts["lost"]] or [("lost", "nothing")]
         if more := facts["lost_unnamed"]:
             lost.append(("lost", f"and {more} more places"))
-        table([written([facts["repaired"]]), *saved, *lost])
-        return
+        return [written([facts["repaired"]]), *saved, *lost]
     row = "{topic:<22} {messages:>9} {samples:>11} {rate:>9} {gaps:>6} {restarts:>8} {invalid:>8}"
     names = ("topic", "messages", "samples", "gaps", "restarts", "invalid")
     say(row.format(rate="rate Hz", **{name: name for name in names}))
@@ -128,10 +127,10 @@ def _show_inspect(facts: Facts) -> None:
         period = topic["sample_period"]
         say(row.format(rate=f"{1 / period:g}" if period else "-", **topic))
     faults = [("fault", text) for text in facts["faults"]] or [("faults", "none found")]
-    table([*_vibration_rows(facts["vibration"]), *faults])
+    return [*_vibration_rows(facts["vibration"]), *faults]
 
 
-def _vibration_rows(found: Facts | None) -> list[tuple[str, str]]:
+def _vibration_rows(found: Facts | None) -> Rows:
     """Return rows of the largest levels by band, as the vibration monitor reported them."""
     if found is None:
         return []
@@ -175,9 +174,9 @@ def _record(args: argparse.Namespace) -> Facts:
     return record_device(given, args.out, ended, waits)
 
 
-def _show_record(facts: Facts) -> None:
+def _show_record(facts: Facts) -> Rows:
     counted = [(name.replace("_", " "), str(n)) for name, n in facts.items() if name != "bag"]
-    table([*counted, written([facts["bag"]])])
+    return [*counted, written([facts["bag"]])]
 
 
 def _declare_import(add: Arguments) -> None:
@@ -192,7 +191,7 @@ def _import(args: argparse.Namespace) -> Facts:
     return {"bag": str(args.out), "files": [asdict(file) for file in found]}
 
 
-def _show_import(facts: Facts) -> None:
+def _show_import(facts: Facts) -> Rows:
     for file in facts["files"]:
         kinds = " and ".join(kind for kind in ("axes", "distance") if file[kind])
         say(f"{file['file']}: {file['rows']} rows of {kinds} at {1 / file['sample_period']:g} Hz")
@@ -207,7 +206,7 @@ def _show_import(facts: Facts) -> None:
                 say(f"    {meaning}: {file[count]}")
     if any(file["own_clock"] for file in facts["files"]):
         say("probe and axes have separate clocks: identify and correct with --by-stamps")
-    table([written([facts["bag"]]), ("next", "check the bag with 'omsm inspect'")])
+    return [written([facts["bag"]]), ("next", "check the bag with 'omsm inspect'")]
 
 
 COMMANDS = (

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from omsm_ros.cli.arguments import Arguments, cell_of
-from omsm_ros.cli.command import CliCommand, Facts, table, written
+from omsm_ros.cli.command import CliCommand, Facts, Rows, written
 from omsm_ros.core.adjustment.source_evaluation import (
     KINDS,
     SPHERE,
@@ -95,7 +95,7 @@ def _entry(one: FoundSource, kind: str, bag: Path, date: str) -> dict[str, Any]:
     }
 
 
-def _show(facts: Facts) -> None:
+def _show(facts: Facts) -> Rows:
     rows = []
     for entry in facts["sources"]:
         order = f"/{entry['per_turn']:g}" if "per_turn" in entry else ""
@@ -103,7 +103,7 @@ def _show(facts: Facts) -> None:
         text = standard(entry["found"], entry["uncertainty"], unit)
         rows.append((source_name(entry["source"] + order), text))
     rows += [(source_name(name), "not shown by this recording") for name in facts["not_shown"]]
-    table([*rows, written([facts["file"]])])
+    return [*rows, written([facts["file"]])]
 
 
 COMMANDS = (CliCommand("sources", _declare, _sources, _show),)

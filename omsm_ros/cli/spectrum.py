@@ -3,7 +3,7 @@
 import argparse
 
 from omsm_ros.cli.arguments import Arguments, cell_of, json_object, values_of
-from omsm_ros.cli.command import CliCommand, Facts, say, table, written
+from omsm_ros.cli.command import CliCommand, Facts, Rows, say, table, written
 from omsm_ros.core.ripple.lines import MOST_LINES
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_surface
@@ -43,7 +43,7 @@ def _spectrum(args: argparse.Namespace) -> Facts:
     return {**facts, "out": str(args.out)}
 
 
-def _show_spectrum(facts: Facts) -> None:
+def _show_spectrum(facts: Facts) -> Rows:
     if facts["exposure"] is not None:
         say(facts["exposure"]["finding"])
     for scan in facts["scans"]:
@@ -62,7 +62,7 @@ def _show_spectrum(facts: Facts) -> None:
         table([("  vibration", one["finding"]) for one in scan["vibration_removed"]])
         if stopped := scan["band_stop"]:
             say(text_from("band stop, zero phase: {rms_before:m} → {rms_after:m} rms", stopped))
-    table([written(facts["files"].values(), facts["out"])])
+    return [written(facts["files"].values(), facts["out"])]
 
 
 def _peak_row(peak: Facts) -> tuple[str, str]:
