@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from omsm_ros import __version__
 from omsm_ros.cli import INTERRUPTED, INTERRUPTION, interruptible
 from omsm_ros.cli.arguments import Arguments, OneLineParser
-from omsm_ros.cli.command import null_device, say, say_lines, table, warn, written
+from omsm_ros.cli.command import CliCommand, null_device, say, say_lines, table, warn, written
 from omsm_ros.cli.words import TASKS, WORDS
 from omsm_ros.errors import (
     DEBUG,
@@ -39,7 +39,7 @@ from omsm_ros.pipelines.progress import refresh_in_thread, state_progress, state
 from omsm_ros.quantities import SEED, TIME_LAPSE, shown
 
 if TYPE_CHECKING:
-    from omsm_ros.cli.command import Facts
+    from omsm_ros.cli.command import Facts, Rows
 
 # Commands that end sooner show no elapsed time.
 _DELAY_S = 1.0
@@ -236,11 +236,11 @@ def parser_of(wanted: Collection[str]) -> argparse.ArgumentParser:
 
 def _declare(word: str, sub: argparse.ArgumentParser) -> None:
     if word == DEMO:
-        _declare_demo(Arguments(sub, word))
-        return
-    with interruptible():  # only the module of this command is loaded
-        module = importlib.import_module(f"omsm_ros.cli.{WORDS[word].module}")
-    command = next(command for command in module.COMMANDS if command.name == word)
+        command = CliCommand(DEMO, _declare_demo, _experiment, _show_experiment)
+    else:
+        with interruptible():  # only the module of this command is loaded
+            module = importlib.import_module(f"omsm_ros.cli.{WORDS[word].module}")
+        command = next(command for command in module.COMMANDS if command.name == word)
     sub.set_defaults(run=command)
     command.declare(Arguments(sub, word))
 
@@ -255,25 +255,22 @@ def _declare_demo(add: Arguments) -> None:
     add("--experiment", str, choices=tuple(EXPERIMENTS))
 
 
-def _experiment(args: argparse.Namespace) -> int:
+def _experiment(args: argparse.Namespace) -> Facts:
     from omsm_ros.pipelines.paper_experiments import run_experiment
 
     module, _, task = EXPERIMENTS[args.experiment].partition(":")
     run = getattr(importlib.import_module(f"omsm_ros.pipelines.{module}"), task)
-    facts = run_experiment(args.experiment, run, args.out, args.seed)
-    if args.json:
-        print(json_and_yaml.text_of(json_and_yaml.unknown_as_null(facts)), flush=True)
-        return DONE
+    return run_experiment(args.experiment, run, args.out, args.seed) | {"out": str(args.out)}
+
+
+def _show_experiment(facts: Facts) -> Rows:
     for row in facts["compared"]:
         paper = row["paper"] or "not printed"
         say(f"{row['name']}: {row['ours']} (paper: {paper}) {row['remark']}".rstrip())
-    table([written(["report.html"], str(args.out))])
-    return DONE
+    return [written(["report.html"], facts["out"])]
 
 
 def _demo(args: argparse.Namespace) -> int:
-    if args.experiment:
-        return _experiment(args)
     # The demonstration is a node itself, so that only its process imports ROS.
     command = [sys.executable, "-m", "omsm_ros.nodes.start", "cell_demo", "--out", str(args.out)]
     command += ["--device", args.device, "--seed", str(args.seed)]
@@ -360,7 +357,7 @@ def _split(given: list[str]) -> tuple[list[str], list[str]]:
 
 def _run(args: argparse.Namespace) -> int:
     check_outputs(args)
-    if args.command == DEMO:
+    if args.command == DEMO and not args.experiment:
         return _demo(args)
     with interrupt_on_signal(), progress_in_background(f"omsm {args.command}", args.json):
         facts = args.run.act(args)
