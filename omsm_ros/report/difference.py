@@ -9,12 +9,13 @@ from matplotlib.figure import Figure
 from omsm_ros.core.comparison.agreement import COVERAGE_FACTOR, ComparedTerm
 from omsm_ros.core.comparison.compare import Comparison
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.readable import NOTHING, count, figure, percent, plain, probability, quantity
+from omsm_ros.messages import text_from
+from omsm_ros.readable import NOTHING, count, percent, plain, probability, quantity
 from omsm_ros.report import style
 from omsm_ros.report.measurement.figures import PROFILES, UNITS_M, cuts, profile
 from omsm_ros.report.measurement.surface_map import EmbeddedMap, Layer, embedded, policy_of, script
 from omsm_ros.report.page_parts import Headline, fill, picture
-from omsm_ros.report.tables import POSE_UNITS, Table
+from omsm_ros.report.tables import POSE_UNITS, Table, filled
 from omsm_ros.report.verdict import PageVerdict
 
 # Half width of a profile's band, and length of its segments, in grid spacings.
@@ -145,44 +146,34 @@ def records(facts: Mapping[str, Any]) -> list[Table]:
 
 
 def _numbers(facts: Mapping[str, Any]) -> Table:
-    rows = [
-        (
-            figure(name),
-            quantity(n["a"], "m", 5),
-            quantity(n["b"], "m", 5),
-            NOTHING if n["expanded"] is None else quantity(n["expanded"], "m"),
-            "not evaluated" if n["e_n"] is None else plain(n["e_n"]),
-        )
+    numbers = [
+        {**n, "name": name, "judged": "not evaluated" if n["e_n"] is None else plain(n["e_n"])}
         for name, n in facts["e_n"].items()
     ]
+    columns = {"A": "{a:m/5}", "B": "{b:m/5}", "U of the difference": "{expanded:m}"}
     title = "Figures of both measurements; U: 95 % for all figures together"
-    return Table(title, ("A", "B", "U of the difference", "E_n"), rows)
+    return filled(title, numbers, "{name:figure}", {**columns, "E_n": "{judged}"})
 
 
 def _terms(facts: Mapping[str, Any]) -> Table:
     zernike = facts["zernike"] or {"terms": ()}
-    rows = [
-        (
-            f"Z({t['n']}, {t['m']})",
-            quantity(t["difference"], "m"),
-            quantity(t["expanded"], "m"),
-            plain(t["e_n"]),
-        )
-        for t in zernike["terms"]
-    ]
-    return Table("Zernike terms of A − B, 1 at the rim", ("A − B", "U, all terms", "E_n"), rows)
+    columns = {"A − B": "{difference:m}", "U, all terms": "{expanded:m}", "E_n": "{e_n:plain}"}
+    title = "Zernike terms of A − B, 1 at the rim"
+    return filled(title, zernike["terms"], "Z({n}, {m})", columns)
+
+
+_OF_A_SIDE = {
+    "file": "{file}",
+    "points": "{points:count}",
+    "scatter of a point about its neighbours": "{scatter:m}",
+    "largest interpolation error, rms": "{interpolation:m}",
+    "cell size of the local fits": "{cell:m}",
+}
 
 
 def _sides(facts: Mapping[str, Any]) -> Table:
     a, b = facts["a"], facts["b"]
-    rows = [("file", str(a["file"]), str(b["file"]))]
-    rows.append(("points", count(a["points"]), count(b["points"])))
-    for key, name in (
-        ("scatter", "scatter of a point about its neighbours"),
-        ("interpolation", "largest interpolation error, rms"),
-        ("cell", "cell size of the local fits"),
-    ):
-        rows.append((name, quantity(a[key], "m"), quantity(b[key], "m")))
+    rows = [(name, *(text_from(t, side) for side in (a, b))) for name, t in _OF_A_SIDE.items()]
     for source in dict.fromkeys([*(a["sources"] or {}), *(b["sources"] or {})]):
         sizes = ((side["sources"] or {}).get(source) for side in (a, b))
         name = f"{source.replace('_', ' ')}, common to all points, rms"
