@@ -5,6 +5,7 @@ from unittest import mock
 
 from omsm_ros import cli
 from omsm_ros.cli import command_line
+from omsm_ros.cli.command import table
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.twin.cell import blocks_of
@@ -26,6 +27,6 @@ def facts(capsys, *arguments):
         assert cli.main([*map(str, arguments), "--json"]) == 0
     machine = json.loads(capsys.readouterr().out)
     args, found = tell.call_args.args
-    args.run.show(found)
+    table(args.run.show(found) or [])
     assert capsys.readouterr().out.strip()
     return machine
