@@ -43,25 +43,17 @@ from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM, Residua
 # friction lag by their whole half widths together; drift and linearity are no errors of motion.
 _PER_SIZE = {PERIODIC: 0.5**0.5, VIBRATION: 0.5**0.5}
 _AT_REVERSALS = (BACKLASH, FRICTION)
-_NUISANCE_CODES = {
-    BACKLASH: "identification.backlash",
-    FRICTION: "identification.friction",
-    LINEARITY: "identification.linearity",
-    PERIODIC: "identification.periodic",
-    VIBRATION: "identification.vibration",
-    DRIFT: "identification.drift",
-}
-_IN_RESPONSE_CODES = {CREEP: "identification.creep", MODE: "identification.mode"}
-_UNMODELLED_CODES = {
-    BACKLASH: "identification.unmodelled_backlash",
-    FRICTION: "identification.unmodelled_friction",
-    LINEARITY: "identification.unmodelled_linearity",
-    PERIODIC: "identification.unmodelled_periodic",
-    VIBRATION: "identification.unmodelled_vibration",
-    DRIFT: "identification.unmodelled_drift",
-    CREEP: "identification.unmodelled_creep",
-    MODE: "identification.unmodelled_mode",
-    STIFFENING: "identification.unmodelled_stiffening",
+# Codes of a model error: found and modelled, and found only. Stiffening has no model.
+_CODES = {
+    BACKLASH: ("identification.backlash", "identification.unmodelled_backlash"),
+    FRICTION: ("identification.friction", "identification.unmodelled_friction"),
+    LINEARITY: ("identification.linearity", "identification.unmodelled_linearity"),
+    PERIODIC: ("identification.periodic", "identification.unmodelled_periodic"),
+    VIBRATION: ("identification.vibration", "identification.unmodelled_vibration"),
+    DRIFT: ("identification.drift", "identification.unmodelled_drift"),
+    CREEP: ("identification.creep", "identification.unmodelled_creep"),
+    MODE: ("identification.mode", "identification.unmodelled_mode"),
+    STIFFENING: ("", "identification.unmodelled_stiffening"),
 }
 # Families of which one may explain the residual of another, as causes in words.
 _MAY_LOOK_ALIKE = {
@@ -102,7 +94,7 @@ def model_errors(searched: SearchResult) -> Iterator[Finding]:
         values = _values(judged.term, size, period)
         values["p"] = float(np.exp(max(judged.log_p, -690)))
         limits = {"false_alarm_p": FALSE_ALARM}
-        yield Finding(_UNMODELLED_CODES[judged.term.family], REJECTS, values, limits)
+        yield Finding(_CODES[judged.term.family][1], REJECTS, values, limits)
     sizes, _ = _sizes(searched)
     pairs = zip(searched.nuisance_terms, sizes, strict=True)
     shown = [(modelled, found.value) for modelled, found in pairs if found.significant]
@@ -113,7 +105,7 @@ def model_errors(searched: SearchResult) -> Iterator[Finding]:
         slow = term.parameter * searched.diagnostics.plateau < 1
         if drifts and slow and term.family == VIBRATION:
             continue
-        code, values = _NUISANCE_CODES[term.family], _values(term, size, period)
+        code, values = _CODES[term.family][0], _values(term, size, period)
         alike = _alike(searched, modelled) if term.family in _MAY_LOOK_ALIKE else []
         if alike:
             code = "identification.undecided"
@@ -121,7 +113,7 @@ def model_errors(searched: SearchResult) -> Iterator[Finding]:
         yield Finding(code, RESERVATION, values)
     for term in searched.added_poles:
         values = _values(term, None, period)
-        yield Finding(_IN_RESPONSE_CODES[term.family], RESERVATION, values)
+        yield Finding(_CODES[term.family][0], RESERVATION, values)
 
 
 def _alike(searched: SearchResult, modelled: ModelledTerm) -> list[str]:
