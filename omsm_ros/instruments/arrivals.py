@@ -7,29 +7,30 @@ do not move it. It is fitted over a window, since crystals change with temperatu
 
 import math
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.core.streams.statistics import slopes_below
+from omsm_ros.core.streams.stamps import (
+    DRIFT_SIGMA,
+    GROSS_DRIFT,
+    LARGEST_CRYSTAL_DRIFT,
+    SPAN_S,
+    expected_drift,
+    line_below,
+)
+from omsm_ros.core.streams.statistics import falling_density_likelihood, slopes_below
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S, PPM
+from omsm_ros.instruments.counting import SteadyMotion
+from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S
 
 # Long enough to average jitter out, short enough to follow a crystal that warms up [s].
 WINDOW_S = 30.0
-# Only the earliest arrival in this time counts, which bounds the fit to 150 points [s].
-_SPAN_S = 0.2
-# Crystals differ by some tens of ppm: the standard uncertainty of the drift before any arrival.
-_DRIFT_SIGMA = 50 * PPM
-# A drift beyond this by five of its standard uncertainties is not that of a crystal: the device
-# is played faster than it was recorded, or set to another rate.
-_LARGEST_CRYSTAL_DRIFT = 1000 * PPM
-# How unlikely such a drift is beforehand (log), and the time of arrivals that shows it [s], or
-# missed triggers would be taken for one.
+# How unlikely the drift of no crystal is beforehand (log), and the time of arrivals that shows it
+# [s], or missed triggers would be taken for one.
 _OTHER_RATE, _OTHER_RATE_S = 12.0, 2.0
-# Points that show a gross drift, and any other one.
-_LEAST_POINTS, _SURE_POINTS = 6, 9
 # A clock was set if all arrivals are late, by the first more than usual, for the second time [s].
 _STEP_S, _STEP_AFTER_S = 0.02, 2.0
 # A busy host delays its first arrivals by less than this, so an arrival that is earlier by more
@@ -39,10 +40,8 @@ _EARLY_S = 1.0
 _OLDEST_S = 3600.0
 # The drift is reported after this time of arrivals [s].
 _LEAST_SPAN_S = 5.0
-# A drift of a tenth or more is another rate; arrivals uneven by 20 ms determine it to 0.01 in 1 s.
-_GROSS, _GROSS_SPAN_S = 0.1, 1.0
-# Delays below this are those of the clocks themselves [s].
-_LEAST_DELAY_S = 1e-6
+# Arrivals uneven by 20 ms determine a drift to 0.01 in 1 s.
+_GROSS_SPAN_S = 1.0
 
 
 class DeviceClock:
@@ -59,7 +58,7 @@ class DeviceClock:
     def restart(self) -> None:
         """Forget all arrivals, as after a restart of the device's clock; stamps still rise."""
         # After the origin: begin of each span [device], and of its earliest arrival time and delay.
-        self._spans: deque[tuple[float, float, float]] = deque(maxlen=round(WINDOW_S / _SPAN_S))
+        self._spans: deque[tuple[float, float, float]] = deque(maxlen=round(WINDOW_S / SPAN_S))
         self._origin = self._newest = (0, 0)
         self._offset = self._slope = self._usual = 0.0
         self._late_since: tuple[float, float] | None = None  # all arrivals [device, arrival; s]
@@ -68,7 +67,7 @@ class DeviceClock:
     def drift(self) -> float | None:
         """Return host seconds per device second, less one; None before it is known."""
         span = self._spans[-1][1] - self._spans[0][1] if self._spans else 0.0
-        patience = _GROSS_SPAN_S if abs(self._slope) > _GROSS else _LEAST_SPAN_S
+        patience = _GROSS_SPAN_S if abs(self._slope) > GROSS_DRIFT else _LEAST_SPAN_S
         return self._slope if span >= patience else None
 
     def observe(self, device_ns: int, arrival_ns: int) -> None:
@@ -105,7 +104,7 @@ class DeviceClock:
 
     def _keep(self, device: float, late: float) -> None:
         """Enter an arrival; the line is fitted when a span ends, and is never above an arrival."""
-        if self._spans and 0 <= device - self._spans[-1][0] < _SPAN_S:
+        if self._spans and 0 <= device - self._spans[-1][0] < SPAN_S:
             if late < self._spans[-1][2]:
                 self._spans[-1] = (self._spans[-1][0], device, late)
         else:
@@ -113,7 +112,7 @@ class DeviceClock:
             while device + late - sum(self._spans[0][1:]) > WINDOW_S:
                 self._spans.popleft()
             _, x, y = np.array(self._spans).T
-            self._offset, self._slope, rest = _line_below(x, y)
+            self._offset, self._slope, rest = line_below(x, y)
             self._usual = float(np.median(rest))
         self._offset += min(late - self._offset - self._slope * device, 0.0)
 
@@ -127,38 +126,6 @@ class DeviceClock:
             return False
         since, arrived = self._late_since = self._late_since or (device, device + late)
         return min(device - since, device + late - arrived) > _STEP_AFTER_S
-
-
-def _line_below(x: FloatArray, y: FloatArray) -> tuple[float, float, FloatArray]:
-    """Return offset, slope and rests (n,) of the likeliest line below the points.
-
-    The rests are exponentially distributed, with an unknown mean, the slopes normally. A busy host
-    delays all arrivals of about a second, so only one rest a second counts.
-    """
-    drift, uncertainty = _expected_drift(x, y)
-    slopes = np.append(slopes_below(x, y), drift)
-    offsets = np.min(y - slopes[:, np.newaxis] * x, axis=1)
-    mean = np.maximum(y.mean() - offsets - slopes * x.mean(), _LEAST_DELAY_S)
-    unlikely = ((slopes - drift) / uncertainty) ** 2 / 2
-    best = np.argmin(len(x) * _SPAN_S * np.log(mean) + unlikely)
-    offset, slope = float(offsets[best]), float(slopes[best])
-    return offset, slope, y - slope * x - offset
-
-
-def _expected_drift(x: FloatArray, y: FloatArray) -> tuple[float, float]:
-    """Return the drift of crystals and its uncertainty.
-
-    Where no crystal has the drift of the regression line, return that and its range.
-    """
-    centred = x - x.mean()
-    square = float(centred @ centred)
-    if len(x) >= _LEAST_POINTS and square > 0:
-        drift = float(centred @ y) / square
-        range_ = 5 * max(float(np.std(y - drift * x)), _LEAST_DELAY_S) / math.sqrt(square)
-        least = _LARGEST_CRYSTAL_DRIFT if len(x) >= _SURE_POINTS else _GROSS
-        if abs(drift) - range_ > least:
-            return drift, range_
-    return 0.0, _DRIFT_SIGMA
 
 
 # The first spans are shorter, so that the first second holds several [s].
@@ -182,10 +149,6 @@ _LATE_PERIODS, _AGE_PERIODS = 0.75, 0.25
 _PARTS = (-0.3, -0.2, -0.1, 0.1, 0.2, 0.3)
 # Spans among whose earliest arrivals two are nearly in time, as a rule.
 _WINDOW = 4
-# Widths of the steps of a density of arrivals above their line, from their resolution on [period].
-_WIDTHS = np.append(0.0, 0.01 * 2.0 ** np.arange(20))
-_RISING = np.triu(np.ones((len(_WIDTHS), len(_WIDTHS)), bool), 1)
-_ACROSS = np.where(_RISING, _WIDTHS - _WIDTHS[:, np.newaxis], 1.0)
 
 
 class MissedTriggerDetector:
@@ -195,16 +158,20 @@ class MissedTriggerDetector:
     others are late by chance. After a missed trigger all arrivals are late by a period. An arrival
     that is not late confirms all samples up to it; lateness alone proves nothing, so until then
     they wait. After a pause of the trigger all arrivals are late for good, after one of the host
-    they return to the line.
+    they return to the line. Axes that move steadily show the triggers without arrivals.
 
     resumed: first arrival after the last pause of the trigger [s]
     lost: triggers may have been missed, and arrivals do not show how many, so nothing is confirmed
         until a restart
     """
 
-    def __init__(self, period: float, pause: float = math.inf) -> None:
-        """period: of the trigger [s];  pause: arrivals late by half of it may be after a pause."""
+    def __init__(self, period: float, pause: float = math.inf, wraps: Sequence[int] = ()) -> None:
+        """period: of the trigger [s];  pause: arrivals late by half of it may be after a pause.
+
+        wraps: counts after which each encoder starts again at zero; 0 = never
+        """
         self._period, self._pause = period, pause
+        self.motion, self._portion = SteadyMotion(wraps), 0
         self._counted, self._ahead = 0, 0.0
         self.restart()
 
@@ -214,12 +181,13 @@ class MissedTriggerDetector:
         ahead: by how much a counter fell back that was reset in a running stream [s]; an arrival in
             time without the reset shows that no trigger was missed at it
         """
-        self._reset = ahead is not None and self._reference.proven and self.trusts_last()
-        if self._reset:  # until an arrival confirms that the trigger went on
+        self.resets = ahead is not None and self._reference.proven and self.trusts_last()
+        if self.resets:  # until an arrival confirms that the trigger went on
             self._ahead += ahead or 0.0
             return
-        self._reference: _Reference = _Reference(self._period)
+        self._reference: _Reference = _Reference(self._period, self.motion.count)
         self._after_pause: _Reference | None = None
+        self._doubted = math.inf  # arrival at which the motion became doubtful [s]
         self._newest = self._paused = 0.0  # last arrival, and last one before the silence [s]
         self.resumed, self.lost = -math.inf, False
 
@@ -231,24 +199,26 @@ class MissedTriggerDetector:
         """
         due += self._ahead
         excess = self._reference.excess(due, arrival)
-        jumped = self._reference.proven and (self._reset or excess < 0)
+        jumped = self._reference.proven and (self.resets or excess < 0)
         if abs(excess) <= self._pause / 2:
             self._after_pause = None
         elif after_silence or (jumped and not self._after_pause):
             self._paused = self._paused if self._after_pause else self._newest
-            self._after_pause = _Reference(self._period)
-        self._newest = arrival
+            self._after_pause = _Reference(self._period, self._portion)
+        self._newest, self._portion = arrival, self.motion.count
+        doubtful = self.motion.doubtful or self.motion.found
+        self._doubted = min(self._doubted, arrival) if doubtful else math.inf
         if self._after_pause is None:
-            confirmed = self._reference.confirms(due, arrival)
+            confirmed = self._reference.confirms(due, arrival, self.motion)
             self.lost |= self._reference.lost
-            self._reset &= not confirmed
+            self.resets &= not confirmed
             return confirmed and not self.lost
-        if not self._after_pause.confirms(due, arrival):
+        if not self._after_pause.confirms(due, arrival, self.motion):
             return False
         # Its line says nothing of triggers missed before the pause.
         self._counted += self._reference.missed
         self.lost |= not self._reference.trusted_until(self._paused)
-        self._reference, self._after_pause, self._reset = self._after_pause, None, False
+        self._reference, self._after_pause, self.resets = self._after_pause, None, False
         self.resumed = self._reference.begin
         return not self.lost
 
@@ -257,7 +227,13 @@ class MissedTriggerDetector:
 
         So it is assumed of a short time; a longer one without an arrival in time is doubtful.
         """
-        return not (self.lost or self._after_pause) and self._reference.trusted_until(self._newest)
+        doubtful = self.lost or self._after_pause or self.motion.doubtful
+        return not doubtful and self._reference.trusted_until(self._newest)
+
+    @property
+    def by_motion(self) -> bool:
+        """Return whether motion alone confirms, so the last step is known after the next one."""
+        return self._reference.confirmed > self._reference.in_time
 
     @property
     def missed(self) -> int:
@@ -277,8 +253,12 @@ class MissedTriggerDetector:
         """
         reference = self._after_pause or self._reference
         found, reference.found = reference.found, 0
+        if self.motion.found and not found:
+            found = self.motion.found
+            reference.expect_missed(found, self._doubted)
+        self.motion.found = 0
         self._counted += found
-        self.lost |= self._reset and found > 0  # before the reset or after it
+        self.lost |= self.resets and found > 0  # before the reset or after it
         return found
 
 
@@ -307,7 +287,7 @@ class _Phases:
 
     def add(self, late: float, arrival: float) -> None:
         """Enter an arrival;  late: [period];  arrival: [s]."""
-        if arrival - self._begin >= _SPAN_S:
+        if arrival - self._begin >= SPAN_S:
             if self._lates:
                 self._end_span(np.array(self._lates))
             self._begin, self._lates = arrival, []
@@ -318,7 +298,7 @@ class _Phases:
         self._means.append((self._begin, *np.exp(2j * np.pi * np.outer(_HARMONICS, early)).mean(1)))
         begin, *means = np.array(self._means).T
         since = (begin - begin[0]).real / self._period
-        most = 5 * _DRIFT_SIGMA  # crystals differ by less
+        most = 5 * DRIFT_SIGMA  # crystals differ by less
         drifts = np.linspace(-most, most, 8 * math.ceil(2 * most * since[-1]) + 1)
         turn = np.exp(-2j * np.pi * np.outer(drifts, since))
         common = [turn**harmonic @ mean for harmonic, mean in zip(_HARMONICS, means, strict=True)]
@@ -334,24 +314,26 @@ class _Reference:
     found: number of missed triggers, if it became certain with the last arrival
     """
 
-    def __init__(self, period: float) -> None:
-        self._period = period
+    def __init__(self, period: float, mark: int) -> None:
+        """mark: number of the first sample."""
+        self._period, self._mark = period, mark  # then of the last confirmed sample
         self._earliest: list[tuple[float, float]] = []  # begin and lateness of each span [s]
         self._line = 0.0, 0.0  # lateness of the earliest at 0, drift
         self.least_missed = 1
         self.proven = self.lost = False
-        self.begin = self.confirmed = self._judged = 0.0
+        self.begin = self.confirmed = self.in_time = self._judged = 0.0  # the third by arrivals
         self.found = 0
         self._phases = _Phases(period)
 
-    def confirms(self, due: float, arrival: float) -> bool:
+    def confirms(self, due: float, arrival: float, motion: SteadyMotion) -> bool:
         """Return whether no trigger was missed before this arrival, as far as can be seen."""
         late = arrival - due
         self._phases.add(late / self._period, arrival)
-        width = _FIRST_S if not self.proven and len(self._earliest) < _FIRST_SPANS else _SPAN_S
-        if self._earliest and arrival - self._earliest[-1][0] < width:
-            begin, least = self._earliest[-1]
-            self._earliest[-1] = (begin, min(least, late))
+        width = _FIRST_S if not self.proven and len(self._earliest) < _FIRST_SPANS else SPAN_S
+        before, least = self._earliest[-1] if self._earliest else (-math.inf, 0.0)
+        goes_on = arrival - before < width
+        if goes_on:
+            self._earliest[-1] = (before, min(least, late))
         else:
             if self._earliest:
                 self._judge()
@@ -364,13 +346,27 @@ class _Reference:
         excess = self.excess(due, arrival)
         # The drift of crystals makes a line uncertain that is not confirmed any more.
         limit = (_AGE_PERIODS if self._phases.locked else _LATE_PERIODS) * self._period
-        limit -= 2 * _DRIFT_SIGMA * (arrival - self.confirmed)
+        limit -= 2 * DRIFT_SIGMA * (arrival - self.in_time)
         beyond = self.least_missed > 0 and (excess > limit or limit <= 0)
-        if not self.proven or self.found or self.lost or beyond:
+        # Triggers that are missed regularly are steps of equal size, too, but at a gross drift.
+        shown = motion.shown_from <= self._mark and excess < GROSS_DRIFT * (arrival - self.begin)
+        in_time = self.proven and not beyond
+        if self.found or self.lost or motion.found or motion.doubtful or not (shown or in_time):
+            if goes_on and before <= self.confirmed > self.in_time:
+                # The earliest one of a span that was late must not be after a missed trigger.
+                self._earliest[-1:] = [(before, least), (arrival, late)]
             return False
-        self.confirmed = arrival
-        self._line = (self._line[0] + min(excess, 0.0), self._line[1])
+        self.confirmed, self._mark = arrival, motion.count - (1 if in_time else 2)
+        if in_time:
+            self.in_time = arrival
+        if self.proven:
+            self._line = (self._line[0] + min(excess, 0.0), self._line[1])
         return True
+
+    def expect_missed(self, missed: int, since: float) -> None:
+        """Expect the arrivals since ``since`` [s] earlier, because triggers were missed then."""
+        ahead = missed * self._period
+        self._earliest = [(begin, y - ahead * (begin >= since)) for begin, y in self._earliest]
 
     def excess(self, due: float, arrival: float) -> float:
         """Return by how much an arrival is later than the earliest ones [s]."""
@@ -392,7 +388,7 @@ class _Reference:
     def trusted_until(self, arrival: float) -> bool:
         """Return whether arrivals until then need not be confirmed, because the time is short."""
         waited = arrival - max(self.confirmed, self.begin)
-        return waited <= (_SPAN_S if self.proven else _UNKNOWN_S)
+        return waited <= (SPAN_S if self.proven else _UNKNOWN_S)
 
     def _judge(self) -> None:
         """Lay the line below the arrivals; look for missed triggers if none is confirmed.
@@ -406,14 +402,15 @@ class _Reference:
             rest = (late - self._line[0] - self._line[1] * begin)[known:][-_SHOWING:] / self._period
             if self._phases.locked and len(rest) == _SHOWING:
                 self.lost |= rest.min() > 1 - _AGE_PERIODS and np.ptp(rest) < _AGE_PERIODS
-        if self.lost or len(begin) < max(_LEAST_SPANS, known + _SHOWING):
+        shown = not self.proven and known == len(begin)  # by steady motion
+        if self.lost or len(begin) < max(_LEAST_SPANS, 0 if shown else known + _SHOWING):
             return
-        waited = float(begin[-1]) - max(self.confirmed, self.begin)
-        if begin[-1] - self._judged < max(_SPAN_S, waited / 10):
+        waited = float(begin[-1]) - (self.confirmed if self.proven else self.begin)
+        if begin[-1] - self._judged < max(SPAN_S, waited / 10):
             return
         self._judged = float(begin[-1])
-        _, drift, rest = _line_below(begin - begin[-1], late)
-        if not self.proven and abs(drift) > _GROSS:  # a backlog, or played in time lapse
+        _, drift, rest = line_below(begin - begin[-1], late)
+        if not self.proven and abs(drift) > GROSS_DRIFT:  # a backlog, or played in time lapse
             if waited < 0.7 * _UNKNOWN_S:  # else the end of a recording stays in doubt
                 return
             self.least_missed = 0
@@ -421,12 +418,13 @@ class _Reference:
             windows = np.sort(sliding_window_view(rest, _WINDOW), axis=1)
             scatter = 2 * float(np.median(windows[:, 1] - windows[:, 0]))
             self.least_missed = max(math.ceil(scatter / self._period + 0.5), 1)
-            if abs(drift) > _LARGEST_CRYSTAL_DRIFT and waited < _OTHER_RATE_S:
+            if abs(drift) > LARGEST_CRYSTAL_DRIFT and waited < _OTHER_RATE_S:
                 return  # missed triggers would look alike
-        locked = self._phases.locked or abs(drift) > _LARGEST_CRYSTAL_DRIFT
-        missed = self._settle(known, locked) if self.least_missed else 0
+        locked = self._phases.locked or abs(drift) > LARGEST_CRYSTAL_DRIFT
+        missed = self._settle(known, locked) if self.least_missed and not shown else 0
         if missed == 0 or (missed and self.proven):
-            self.proven, self.confirmed = True, self._judged
+            self.proven, self.in_time = True, self._judged
+            self.confirmed = max(self.confirmed, self._judged)
             self.least_missed = min(self.least_missed, 1)
             self._set_line(len(begin))
         self.found = missed or 0
@@ -461,7 +459,7 @@ class _Reference:
             # No other change of the delay explains the step better than missed triggers.
             if max(shifted(at, best + part)[0] for part in _PARTS) - none - most > _EXCLUDED:
                 return None
-            self._earliest[at:] = [(b, y - best * self._period) for b, y in self._earliest[at:]]
+            self.expect_missed(best, float(begin[at]))
             return best
         seen = np.max([*likely.values()], axis=0) < -_EXCLUDED
         off = sliding_window_view(rest, _SHOWING).min(axis=1).max() if locked else 0.0
@@ -471,7 +469,7 @@ class _Reference:
     def _set_line(self, known: int) -> None:
         """Lay the highest line below the earliest arrivals of the first spans."""
         begin, late = np.array(self._earliest[:known]).T
-        least, drift, _ = _line_below(begin - begin[-1], late)
+        least, drift, _ = line_below(begin - begin[-1], late)
         self._line = (least - drift * float(begin[-1]), drift)
 
 
@@ -480,21 +478,13 @@ def _likelihood(x: FloatArray, y: FloatArray, period: float) -> tuple[float, Flo
 
     x: times [s];  y: lateness [period], (n,)
 
-    Long delays are rarer than short ones, so the density of the rests falls. The likeliest one that
-    does is the slope of the least concave curve above their cumulative number (Grenander 1956),
-    here between ``_WIDTHS``. The two arrivals that define the line do not count.
+    Long delays are rarer than short ones. The two arrivals that define the line do not count.
     """
-    drift, uncertainty = (each / period for each in _expected_drift(x, y * period))
+    drift, uncertainty = (each / period for each in expected_drift(x, y * period))
     slopes = np.append(slopes_below(x, y), drift)
     rests = y - slopes[:, np.newaxis] * x
     rests -= rests.min(axis=1, keepdims=True)
-    late = np.sort(rests, axis=1)[:, 2:, np.newaxis]
-    number = np.count_nonzero(late <= np.append(-1.0, _WIDTHS[1:]), axis=1)
-    up = np.where(_RISING, (number[:, np.newaxis] - number[..., np.newaxis]) / _ACROSS, -np.inf)
-    most = np.maximum.accumulate(up[..., ::-1], axis=2)[..., ::-1]
-    density = np.where(_RISING, most, np.inf).min(axis=1)[:, 1:] / late.shape[1]
-    each = np.diff(number, axis=1)
-    likely = np.sum(each * np.log(np.where(each, density, 1.0)), axis=1)
+    likely = falling_density_likelihood(np.sort(rests, axis=1)[:, 2:])
     likely -= ((slopes - drift) / uncertainty) ** 2 / 2
     best = int(np.argmax(likely))
     return float(likely[best]) - (_OTHER_RATE if drift else 0.0), rests[best]

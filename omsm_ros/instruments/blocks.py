@@ -103,7 +103,8 @@ class BlockCutter:
         together = channels.distance and channels.axes is not None
         watched = not (channels.timed or free or together)
         period, pause = settings.sample_period, settings.pause
-        self.detector = MissedTriggerDetector(period, pause) if watched else None
+        wraps = [axis.wrap for axis in channels.axes or ()]
+        self.detector = MissedTriggerDetector(period, pause, wraps) if watched else None
         # Arrival, the same by the clock of the stamps, whether after a silence.
         self._waiting: deque[tuple[float, int, bool, list[CountedRun]]] = deque()
         self._counts = np.zeros(len(AXES), np.int64)  # of the last sample
@@ -169,22 +170,27 @@ class BlockCutter:
                 self.withhold()
                 self._waiting.append((now, arrival_ns, after_silence, together := []))
                 self._skipped = 0
-            together.append(replace(run, first_sample=run.first_sample + self._skipped))
-            self._end = together[-1].first_sample + len(run.samples)
+            first = run.first_sample + self._skipped
+            linked = self.detector.resets if run.restarted else first == self._end
+            linked &= not (after_silence and i == 0)
+            self.detector.motion.follow(run.samples["counts"], linked=linked)
+            together.append(replace(run, first_sample=first))
+            self._end = first + len(run.samples)
         due = (self._end - 1) * period
         if self.detector.confirms(due, now, after_silence=after_silence):
-            yield from self._release(self.detector)
+            yield from self._release(self.detector, self.detector.by_motion)
         elif missed := self.detector.forget_missed():
             self.withhold()
             self._skipped += missed
+            self._end += missed
         patience = _LONG_S if self.detector.missed else _LONGEST_S
         self.unconfirmed |= bool(self._waiting) and self._waiting[0][0] < now - patience
         self.withhold(now - _LONGEST_S)
 
-    def _release(self, detector: MissedTriggerDetector) -> Iterator[BlockPair]:
-        """Yield the blocks completed by the samples that wait."""
+    def _release(self, detector: MissedTriggerDetector, kept: int = 0) -> Iterator[BlockPair]:
+        """Yield the blocks completed by the samples that wait, but the last ``kept`` portions."""
         self.unconfirmed = False
-        while self._waiting:
+        while len(self._waiting) > kept:
             came, came_ns, after_silence, runs = self._waiting.popleft()
             if came == detector.resumed:
                 self._clock.restart()

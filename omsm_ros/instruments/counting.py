@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeAlias, TypeVar
@@ -398,3 +398,80 @@ class Turns:
     def _shorter(self, steps: _Steps) -> _Steps:
         half = self._wrap // 2
         return (steps + half) % self._wrap - half
+
+
+# Steps that differ by a smaller part than this are of one trigger each; so many of them in a row
+# are no chance of encoder noise. A step of several is a whole multiple but for the last part.
+_STEADY_PART, _STEADY_STEPS, _WHOLE_PART = 1 / 8, 32, 1 / 4
+_NO_WRAP = 1 << 62
+
+
+class SteadyMotion:
+    """Shows by the steps of moving axes that no trigger was missed, or how many were.
+
+    No axis doubles its speed from one sample to the next. So nearly equal steps are of one trigger
+    each, and a step that is a multiple of those before and after it is of several.
+
+    count: number of samples so far
+    doubtful: the last uneven step may be one of several triggers, as the next samples will show
+    found: number of missed triggers, if it became certain with the last samples
+    """
+
+    def __init__(self, wraps: Sequence[int]) -> None:
+        """wraps: counts after which each encoder starts again at zero; 0 = never."""
+        self._wraps = np.array([wrap or _NO_WRAP for wrap in wraps], np.int64)
+        self.count = self.found = 0
+        self.follow(np.empty((0, len(wraps)), np.int64), linked=False)
+
+    @property
+    def shown_from(self) -> int:
+        """Return the number of the sample since which all triggers are known."""
+        run = int(self._runs.max(initial=0))
+        return self.count - (run + 1 if run >= _STEADY_STEPS else -1)
+
+    def follow(self, counts: IntArray, *, linked: bool) -> None:
+        """Enter the counts of consecutive samples, (n, axes);  linked: to those before."""
+        if not linked:
+            self._last: IntArray | None = None
+            self._begun = self.count
+            self._step, self._runs = np.zeros((2, len(self._wraps)), np.int64)
+            # Axis, number of even steps before the jump, the last one, missed triggers, sample.
+            self._jump, self.doubtful = (0, 0, 0, 0, 0), False
+        for start in range(0, len(counts), _STEADY_STEPS):
+            self._follow(counts[start : start + _STEADY_STEPS, : len(self._wraps)])
+            if self.doubtful:
+                self._settle(*self._jump)
+
+    def _follow(self, counts: IntArray) -> None:
+        half, before = self._wraps // 2, counts[:1] if self._last is None else self._last
+        steps = (np.diff(counts, axis=0, prepend=before) + half) % self._wraps - half
+        steps = np.concatenate([[self._step], steps])
+        least = _STEADY_PART * np.minimum(np.abs(steps[1:]), np.abs(steps[:-1]))
+        # Smaller steps are uneven by the resolution of the encoder.
+        uneven = (least < 1) | (np.abs(np.diff(steps, axis=0)) > least)
+        uneven[: max(self._begun + 2 - self.count, 0)] = False  # no step, and none before it
+        for axis, places in enumerate(map(np.flatnonzero, uneven.T)):
+            run = int(self._runs[axis]) + int([*places, len(counts)][0])
+            self._runs[axis] = len(counts) - 1 - places[-1] if len(places) else run
+            if len(places) and run >= _STEADY_STEPS:
+                step, jump = (int(value) for value in steps[places[0] : places[0] + 2, axis])
+                times = round(jump / step)
+                if times > 1 and abs(jump / step - times) <= _WHOLE_PART:
+                    self._jump = (axis, run, step, times - 1, self.count + int(places[0]))
+                    self.doubtful = True
+        self._last, self._step = counts[-1:], steps[-1]
+        self.count += len(counts)
+
+    def _settle(self, axis: int, run: int, step: int, missed: int, sample: int) -> None:
+        """Decide whether the jump was of several triggers: if even steps as before follow it.
+
+        If another axis made no jump, and none after it, it was of one.
+        """
+        even, since = int(self._runs[axis]), self.count - 1 - sample
+        self.doubtful = even == max(since - 1, 0)
+        if self.doubtful and even >= _STEADY_STEPS:
+            self.doubtful = False
+            alike = abs(self._step[axis] - step) <= _STEADY_PART * abs(step)
+            if alike and self.shown_from >= sample:
+                self.found += missed
+                self._runs[axis] += run + 2

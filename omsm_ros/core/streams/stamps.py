@@ -6,6 +6,7 @@ session gives the time of every sample. Its slope shows a stated sample period t
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from omsm_ros.core.streams.blocks import Block, FloatArray, IntArray
+from omsm_ros.core.streams.statistics import slopes_below
 from omsm_ros.errors import DataError, Notice
-from omsm_ros.units import NANOSECONDS_PER_S
+from omsm_ros.units import NANOSECONDS_PER_S, PPM
 
 # Sample clocks are quartz oscillators; a stated period that is off by more is wrong.
 _MAX_RATE_ERROR = 1e-3
@@ -261,3 +263,50 @@ class StampHistory:
         (first, *_, began), (last, *_, ended) = self.rows[0], self.rows[-1]
         elapsed, passed = (last - first) * period_ns, ended - began
         return bool(elapsed < _TIME_LAPSE * passed and passed < _TIME_LAPSE * elapsed)
+
+
+# Only the earliest arrival in this time counts, which bounds the fit to 150 points [s].
+SPAN_S = 0.2
+# Crystals differ by some tens of ppm: the standard uncertainty of the drift before any arrival.
+DRIFT_SIGMA = 50 * PPM
+# A drift beyond this by five of its standard uncertainties is not that of a crystal: the device
+# is played faster than it was recorded, or set to another rate.
+LARGEST_CRYSTAL_DRIFT = 1000 * PPM
+# Points that show a gross drift, and any other one.
+_LEAST_POINTS, _SURE_POINTS = 6, 9
+# A drift of a tenth or more is another rate.
+GROSS_DRIFT = 0.1
+# Delays below this are those of the clocks themselves [s].
+_LEAST_DELAY_S = 1e-6
+
+
+def line_below(x: FloatArray, y: FloatArray) -> tuple[float, float, FloatArray]:
+    """Return offset, slope and rests (n,) of the likeliest line below the points.
+
+    The rests are exponentially distributed, with an unknown mean, the slopes normally. A busy host
+    delays all arrivals of about a second, so only one rest a second counts.
+    """
+    drift, uncertainty = expected_drift(x, y)
+    slopes = np.append(slopes_below(x, y), drift)
+    offsets = np.min(y - slopes[:, np.newaxis] * x, axis=1)
+    mean = np.maximum(y.mean() - offsets - slopes * x.mean(), _LEAST_DELAY_S)
+    unlikely = ((slopes - drift) / uncertainty) ** 2 / 2
+    best = np.argmin(len(x) * SPAN_S * np.log(mean) + unlikely)
+    offset, slope = float(offsets[best]), float(slopes[best])
+    return offset, slope, y - slope * x - offset
+
+
+def expected_drift(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Return the drift of crystals and its uncertainty.
+
+    Where no crystal has the drift of the regression line, return that and its range.
+    """
+    centred = x - x.mean()
+    square = float(centred @ centred)
+    if len(x) >= _LEAST_POINTS and square > 0:
+        drift = float(centred @ y) / square
+        range_ = 5 * max(float(np.std(y - drift * x)), _LEAST_DELAY_S) / math.sqrt(square)
+        least = LARGEST_CRYSTAL_DRIFT if len(x) >= _SURE_POINTS else GROSS_DRIFT
+        if abs(drift) - range_ > least:
+            return drift, range_
+    return 0.0, DRIFT_SIGMA

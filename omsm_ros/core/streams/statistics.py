@@ -56,6 +56,27 @@ def noise_of(deviation: FloatArray) -> float:
     return spread(np.diff(deviation, 2)) / float(np.sqrt(6))
 
 
+# Widths of the steps of a falling density, from the resolution of its values on.
+_WIDTHS = np.append(0.0, 0.01 * 2.0 ** np.arange(20))
+_RISING = np.triu(np.ones((len(_WIDTHS), len(_WIDTHS)), bool), 1)
+_ACROSS = np.where(_RISING, _WIDTHS - _WIDTHS[:, np.newaxis], 1.0)
+
+
+def falling_density_likelihood(values: FloatArray) -> FloatArray:
+    """Return the log likelihood (m,) of each row of positive ``values`` (m, n).
+
+    The likeliest density that falls is the slope of the least concave curve above their cumulative
+    number (Grenander 1956), here between ``_WIDTHS``.
+    """
+    number = np.count_nonzero(values[..., np.newaxis] <= np.append(-1.0, _WIDTHS[1:]), axis=1)
+    up = np.where(_RISING, (number[:, np.newaxis] - number[..., np.newaxis]) / _ACROSS, -np.inf)
+    most = np.maximum.accumulate(up[..., ::-1], axis=2)[..., ::-1]
+    density = np.where(_RISING, most, np.inf).min(axis=1)[:, 1:] / values.shape[1]
+    each = np.diff(number, axis=1)
+    likely: FloatArray = np.sum(each * np.log(np.where(each, density, 1.0)), axis=1)
+    return likely
+
+
 class RunningScatter:
     """Running scatter of the heights of a scan, independent of their division into blocks.
 
