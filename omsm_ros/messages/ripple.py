@@ -39,8 +39,8 @@ ripple.same_wavelength_on_radius: the same wavelength from ring to ring in {scan
 ripple.aliased_texture: {scans:list} resolves a texture of {wavelength:m/4}, shorter than twice the
     sampling distance here; this line is its alias
 ripple.same_order: {order} waves a turn in {scans:list} as well, at another speed
-ripple.order_or_form_on_circle: on one circle a form error of that order looks the same, and so does
-    the nominal form if {opt.nominal} is not given
+ripple.order_or_form_on_circle: on one circle a form error of the part of that order looks the same,
+    and so does its nominal form if {opt.nominal} is not given
 ripple.same_frequency: the same frequency in {scans:list}, at another speed over the part
 ripple.rate: {rate:Hz/4}
 ripple.other_rates: present in {scans:list}, sampled at {rates:list}, where {frequency:Hz/6} is
