@@ -276,14 +276,12 @@ class FormOf:
         values = net.part.values(places.x, places.y)
         height = _heights(solution, values, places)
         # The cells follow from the parameters: a − A β.
-        rows = net.cell_sums(scales)[places.cell]
+        common, along = net.cell_sums(scales)
+        rows = np.concatenate([common[places.cell], along[places.cell].toarray()], axis=1)
         rows *= -share[places.cell, np.newaxis]
         rows[:, net.terms] += values
         columns, fit = _pose(places, nominal, removed)
-        number = len(height)
-        member = scipy.sparse.csr_array(
-            (np.ones(number), (np.arange(number), places.cell)), shape=(number, len(share))
-        )
+        member = scipy.sparse.eye_array(len(share), format="csr")[places.cell]
         return cls(
             solution, nominal, tuple(removed), places, height - columns @ (fit @ height),
             fit @ height, values, rows, share, member, columns, fit,

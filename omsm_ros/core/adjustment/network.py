@@ -12,7 +12,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import linalg, sparse
@@ -53,6 +53,18 @@ class Scales:
         return float(np.sqrt(self.cells + sum(s for d, s in self.bands.items() if d <= RINGS)))
 
 
+class _Sums(NamedTuple):
+    """Sums over the blocks of one scan: XᵀWX, and Σ w x over each cell.
+
+    matrix: (p, p);  common: of families and terms (cells, k);  along: of its knots (cells, l), of
+        which the few turns through a cell have some
+    """
+
+    matrix: FloatArray
+    common: FloatArray
+    along: sparse.csr_array
+
+
 @dataclass(frozen=True, eq=False)
 class Network:
     """The design of all scans, and its normal equations.
@@ -71,7 +83,7 @@ class Network:
     _values: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     _hats: sparse.csr_array = field(init=False)
     _member: sparse.csr_array = field(init=False)
-    _sums: list[tuple[FloatArray, FloatArray]] = field(init=False, default_factory=list)
+    _sums: list[_Sums] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
         blocks, place, begin = self.blocks, {}, 0
@@ -116,9 +128,9 @@ class Network:
         mine = self.blocks.scan == scan
         part = replace(self.part, cell=self.part.cell[mine])
         made = Network(self.blocks.only(mine), (), part, _values=self._values[mine])
-        matrix, sums = self._by_scan()[scan]
+        matrix, sums, along = self._by_scan()[scan]
         begin = self.terms.start
-        made._sums.append((matrix[begin:, begin:], sums[:, begin:]))
+        made._sums.append(_Sums(matrix[begin:, begin:], sums[:, begin:], along))
         return made
 
     def with_families(self, extra: Sequence[Family], columns: FloatArray) -> Network:
@@ -140,8 +152,8 @@ class Network:
         knots, split = self.knots[scan], self.terms.stop
         return [(slice(split), slice(split)), (knots, slice(split, None))]
 
-    def _by_scan(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Return XᵀWX and Σ w x over each cell of each scan by white noise alone.
+    def _by_scan(self) -> list[_Sums]:
+        """Return the sums of each scan by white noise alone.
 
         Made once: with the noise of each scan they are summed anew, whatever it is.
         """
@@ -149,19 +161,17 @@ class Network:
             self._sums.extend(self._sums_of(k) for k in range(self.blocks.scans))
         return self._sums
 
-    def _sums_of(self, scan: int) -> tuple[FloatArray, FloatArray]:
+    def _sums_of(self, scan: int) -> _Sums:
         mine = np.flatnonzero(self.blocks.scan == scan)
         knots, split = self.knots[scan], self.terms.stop
-        size = split + knots.stop - knots.start
-        matrix, sums = np.zeros((size, size)), np.zeros((self.part.cells, size))
+        size, cells = split + knots.stop - knots.start, self.part.cells
+        matrix, sums = np.zeros((size, size)), np.zeros((cells, split))
         root = 1 / np.sqrt(self.blocks.variance[mine])
         number = np.arange(len(mine))
-        member = sparse.csc_array((root, (self.part.cell[mine], number)), (len(sums), len(mine)))
-        # Two hats of a block are not zero: their products are sparse.
+        member = sparse.csc_array((root, (self.part.cell[mine], number)), (cells, len(mine)))
         hats = self._hats[mine, knots.start - split : knots.stop - split]
         hats = sparse.diags_array(root) @ hats
         matrix[split:, split:] = (hats.T @ hats).toarray()
-        sums[:, split:] = (member @ hats).toarray()
         for first in range(0, len(mine), _PORTION):
             here = slice(first, first + _PORTION)
             part = mine[here]
@@ -169,27 +179,31 @@ class Network:
             rows *= root[here, np.newaxis]
             matrix[:split, :split] += rows.T @ rows
             matrix[split:, :split] += hats[here].T @ rows
-            sums[:, :split] += member[:, here] @ rows
+            sums += member[:, here] @ rows
         matrix[:split, split:] = matrix[split:, :split].T
-        return matrix, sums
+        return _Sums(matrix, sums, member @ hats)
 
-    def cell_sums(self, scales: Scales) -> FloatArray:
-        """Return Σ w x over each cell, (cells, size)."""
-        made = np.zeros((self.part.cells, self.size))
-        for k, (_, sums) in enumerate(self._by_scan()):
-            for here, place in self._own(k):
-                made[:, here] += sums[:, place] / scales.noise[k]
-        return made
+    def cell_sums(self, scales: Scales) -> tuple[FloatArray, sparse.csr_array]:
+        """Return Σ w x over each cell, of families and terms (cells, k), of knots (cells, l)."""
+        scans = list(zip(self._by_scan(), scales.noise, strict=True))
+        common = np.add.reduce([one.common / noise for one, noise in scans])
+        return common, sparse.hstack([one.along / noise for one, noise in scans], format="csr")
 
     def normal_matrix(self, scales: Scales) -> FloatArray:
         """Return XᵀV⁻¹X with the cells eliminated, (size, size): of the geometry alone."""
-        share = self.cell_share(self.weights(scales), scales)
-        sums = self.cell_sums(scales)
-        sums *= np.sqrt(share)[:, np.newaxis]
-        made = -(sums.T @ sums)
-        for k, (matrix, _) in enumerate(self._by_scan()):
+        root = np.sqrt(self.cell_share(self.weights(scales), scales))
+        common, along = self.cell_sums(scales)
+        common *= root[:, np.newaxis]
+        along = sparse.diags_array(root) @ along
+        split, made = self.terms.stop, np.empty((self.size, self.size))
+        made[:split, :split] = common.T @ common
+        made[split:, :split] = along.T @ common
+        made[:split, split:] = made[split:, :split].T
+        made[split:, split:] = (along.T @ along).toarray()
+        np.negative(made, out=made)
+        for k, one in enumerate(self._by_scan()):
             for (row, top), (column, left) in itertools.product(self._own(k), repeat=2):
-                made[row, column] += matrix[top, left] / scales.noise[k]
+                made[row, column] += one.matrix[top, left] / scales.noise[k]
         return made
 
     def pulled(self, scales: Scales, y: FloatArray) -> FloatArray:
@@ -232,7 +246,7 @@ class Network:
         and its standard uncertainty by ``covariance`` (size, size) [m]."""
         here, blocks = self.place[name], self.blocks
         # The inverse variance of a block is its number of points over the variance of one.
-        power = np.add.reduce([noise**2 * matrix[here, here] for noise, (matrix, _)
+        power = np.add.reduce([noise**2 * one.matrix[here, here] for noise, one
                                in zip(blocks.noise, self._by_scan(), strict=True)])  # fmt: skip
         power /= blocks.count.sum()
         square = np.array([values @ power @ values, np.sum(power * covariance)])
