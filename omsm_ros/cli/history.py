@@ -12,7 +12,7 @@ from omsm_ros.core.calibration.repeatability import LinearTrend
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.json_and_yaml import unknown_as_null
 from omsm_ros.quantities import shown
-from omsm_ros.readable import NOTHING, count, measured, plain, quantity
+from omsm_ros.readable import NOTHING, count, expanded, measured, plain, quantity
 from omsm_ros.units import DAY_S
 
 _SHOWN_ROWS = 20
@@ -81,9 +81,10 @@ def _show_history(facts: Facts) -> Rows:
                 f"gain {plain(row['static_gain'], 6)}  {row['verdict']}"
             )
         for row in machine["measurements"][-_SHOWN_ROWS:]:
+            rms = expanded(row["deviation_rms"], row["deviation_rms_uncertainty"], "m")
             say(
-                f"  {_when(row)}  {Path(row['bag']).name}  "
-                f"form {quantity(row['deviation_rms'], 'm')} rms  by {row['calibration'][:8]}"
+                f"  {_when(row)}  {Path(row['bag']).name}  form {rms} rms  "
+                f"by {row['calibration'][:8]}"
             )
         counts = (count(len(machine[kind])) for kind in ("calibrations", "measurements"))
         table(

@@ -82,12 +82,24 @@ class Catalogue:
                 sqlalchemy.event.listen(self._engine, "connect", _bounded)
             for table in self._tables.values():
                 try:
-                    table.create(self._engine, checkfirst=True)
+                    self._make(table)
                 except sqlalchemy.exc.DBAPIError as err:
                     # Another process may create it at the same time.
-                    if "already exists" not in str(err):
+                    if not any(word in str(err) for word in ("already exists", "duplicate")):
                         raise
         return self
+
+    def _make(self, table: Any) -> None:
+        """Create a table, or add the columns that it lacks if an earlier version made it."""
+        table.create(self._engine, checkfirst=True)
+        there = {
+            column["name"] for column in self._sql.inspect(self._engine).get_columns(table.name)
+        }
+        with self._engine.begin() as connection:
+            for column in (c for c in table.c if c.name not in there):
+                kind = column.type.compile(self._engine.dialect)
+                change = f"ALTER TABLE {table.name} ADD COLUMN {column.name} {kind}"
+                connection.execute(self._sql.text(change))
 
     def __exit__(self, *_: object) -> None:
         self._engine.dispose()
@@ -190,6 +202,7 @@ _CALIBRATION_FIGURES = (
 # Column, and place of its value in the summary.
 _MEASUREMENT_FIGURES = {
     "deviation_rms": ("figures", "rms", "value"),
+    "deviation_rms_uncertainty": ("figures", "rms", "standard_uncertainty"),
     "deviation_peak_to_valley": ("figures", "peak_to_valley", "value"),
     "dynamic_error_rms": ("dynamic_error_before", "rms"),
     "uncertainty_median": ("uncertainty", "median"),

@@ -48,6 +48,7 @@ class Series:
 TEMPERATURE = Series("Temperature", ("conditions", "temperature", "mean"), "°C")
 SERIES = (
     Series("Form deviation, rms", ("figures", "rms", "value")),
+    Series("u of the rms (k = 1)", ("figures", "rms", "standard_uncertainty"), judged=False),
     Series("Form deviation, PV", ("figures", "peak_to_valley", "value")),
     Series(
         "u of the PV (k = 1)", ("figures", "peak_to_valley", "standard_uncertainty"), judged=False
@@ -224,11 +225,12 @@ def draw(machines: Sequence[Mapping[str, Any]]) -> bytes:
             rows = [r for r in machine["calibrations"] if (r["verdict"] == "rejected") == rejected]
             _points(lag, rows, "delay", "delay_uncertainty", MICROSECOND_S, colour, mark)
             _points(gain, rows, "static_gain", "static_gain_uncertainty", 1.0, colour, mark)
-        _points(form, machine["measurements"], "deviation_rms", "", NANOMETRE_M, colour, ".")
+        rms, spread = "deviation_rms", "deviation_rms_uncertainty"
+        _points(form, machine["measurements"], rms, spread, NANOMETRE_M, colour, ".")
         lag.plot([], [], "o", color=colour, label=style.named(machine["machine"]) or "not named")
     style.label(lag, y="µs", title="Low-frequency delay, k = 2")
     style.label(gain, title="Static gain, k = 2")
-    style.label(form, y="nm", title="Form deviation, rms", x="recorded (UTC)")
+    style.label(form, y="nm", title="Form deviation, rms, k = 2", x="recorded (UTC)")
     bare = [panel for panel in (lag, gain, form) if not panel.containers]
     for panel in bare:
         panel.set_yticks([])
@@ -252,5 +254,5 @@ def _points(
         return
     when = [row["recorded_at"] or row["added_at"] for row in known]
     values = np.array([row[name] for row in known]) / unit
-    bars = np.array([2 * (row[spread] or 0.0) / unit for row in known]) if spread else None
+    bars = np.array([2 * (row[spread] or 0.0) / unit for row in known])
     panel.errorbar(when, values, bars, fmt=mark, color=colour, markersize=4, linewidth=0.8)

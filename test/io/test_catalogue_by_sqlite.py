@@ -84,6 +84,18 @@ def test_a_measurement_is_a_row_of_its_summary(tmp_path, address):
     assert row["folder"] == str(folder)
 
 
+def test_a_catalogue_of_an_earlier_version_gets_the_columns_that_it_lacks(tmp_path, address):
+    form = {"rms": {"value": 8e-9, "standard_uncertainty": 3e-9}}
+    keep_measurement(address, folder_with(tmp_path / "a", figures=form))
+    with closing(sqlite3.connect(address)) as base:
+        base.execute("ALTER TABLE measurements DROP COLUMN deviation_rms_uncertainty")
+        base.commit()
+    keep_measurement(address, folder_with(tmp_path / "b", figures=form))
+    (machine,) = history(address)[0]
+    held = [(r["deviation_rms"], r["deviation_rms_uncertainty"]) for r in machine["measurements"]]
+    assert sorted(held, key=str) == [(8e-9, 3e-9), (8e-9, None)]
+
+
 @pytest.mark.parametrize(
     ("part", "column"),
     [
