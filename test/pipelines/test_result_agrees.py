@@ -130,14 +130,14 @@ def test_the_page_says_what_the_summary_says(page, summary):
     assert says(detail.partition("at most ")[2], 2 * summary["uncertainty"]["largest"])
     points = page.headlines["Surface points"][0]
     assert int(points.replace(" ", "")) == summary["samples"]["distance"]["corrected"]
-    budget = {row["source"].replace("_", " "): row for row in summary["budget"]["sources"]}
+    budget = {row["source"]: row for row in summary["budget"]["sources"]}
     (table,) = (t for t in page.tables if t["title"].startswith("Uncertainty of the heights"))
     *known, open_ones = table["rows"]
     assert open_ones[0] == "not evaluated"
     assert len(known) == sum(row["status"] != "not evaluated" for row in budget.values())
     largest = max(row["height"] or 0.0 for row in budget.values())
     for row in known:
-        name = next(n for n in budget if row[0].startswith(f"{n} ("))
+        name = next(n for n in budget if row[0].endswith(f" ({n})"))
         assert says(row[2], budget[name]["height"], largest=largest), name
     provenance = page.table("Provenance")
     assert provenance["recording"] == [summary["bag"].replace("\u202f", " ")]
