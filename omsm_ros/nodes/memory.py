@@ -3,19 +3,18 @@
 The module has no slow imports, since it is needed before the others load.
 """
 
-import ctypes
 import gc
 import os
 import signal
 import sys
 from collections.abc import Collection
 from contextlib import suppress
+from typing import Any
 
 RETURN_PERIOD_S = 10.0
 """Time between two returns of free memory to the system [s]."""
 
 _M_ARENA_MAX = -8  # of <malloc.h>
-_LIBC = ctypes.CDLL(None)
 _SETTINGS, _KEPT_BY_THREADS = "GLIBC_TUNABLES", "glibc.malloc.tcache_count"
 
 
@@ -27,7 +26,7 @@ def use_single_malloc_arena(held_back: Collection[signal.Signals] = ()) -> None:
     start of a process, so this process executes itself again, unless it is set. Signals
     ``held_back`` are blocked until then.
     """
-    mallopt = getattr(_LIBC, "mallopt", None)  # glibc has it
+    mallopt = _of_glibc("mallopt")
     if mallopt is None:
         return
     mallopt(_M_ARENA_MAX, 1)
@@ -61,6 +60,12 @@ def return_free_memory() -> None:
     cycles, and up to 2000 empty tuples of each length, let a node grow for hours.
     """
     gc.collect()
-    trim = getattr(_LIBC, "malloc_trim", None)  # glibc has it
+    trim = _of_glibc("malloc_trim")
     if trim is not None:
         trim(0)
+
+
+def _of_glibc(name: str) -> Any:
+    import ctypes  # here, because signals are not handled while this module loads
+
+    return getattr(ctypes.CDLL(None), name, None)
