@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import tempfile
 import time
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.row import Row, at_least, at_most
+from omsm_ros.core.streams.blocks import Status
 from omsm_ros.errors import DeviceError
 from omsm_ros.instruments.chrocodile.emulator import ChrocodileEmulator, ChrocodilePacketEmulator
 from omsm_ros.instruments.chrocodile.packet_protocol import (
@@ -22,6 +24,7 @@ from omsm_ros.instruments.chrocodile.packet_protocol import (
 )
 from omsm_ros.instruments.chrocodile.protocol import BinaryDecoder
 from omsm_ros.instruments.chrocodile.telegram import ENCODERS_AT_START, Layout
+from omsm_ros.instruments.emulator import Measured, RecordingSource
 from omsm_ros.instruments.emulator_factory import emulated, line_for
 from omsm_ros.instruments.factory import make_device
 from omsm_ros.instruments.parameters import defaults
@@ -80,10 +83,23 @@ def _decoding() -> Iterator[Row]:
 # Drivers.
 
 
+class _Endless(RecordingSource):
+    """Samples without end: a surface at 10 µm, all axes at zero."""
+
+    def __init__(self) -> None:
+        self.length, self.period = math.inf, 1e-3
+
+    def take(self, first: int, count: int) -> Measured:
+        """Return ``count`` samples."""
+        zero = np.zeros(count)
+        status = np.full(count, Status.OK, np.uint8)
+        return Measured(zero + 10e-6, np.float32(zero + 0.5), status, dict.fromkeys("xyzbc", zero))
+
+
 def _serve(name: str, link: str, link_queue: multiprocessing.Queue[str], stop: Event) -> None:
     with line_for(link) as line:
         link_queue.put(line.path)
-        _EMULATORS[name](line).serve(stop)  # type: ignore[arg-type]
+        _EMULATORS[name](line, _Endless()).serve(stop)  # type: ignore[arg-type]
 
 
 def read(name: str, link: str, period: float, seconds: float) -> dict[str, float]:
