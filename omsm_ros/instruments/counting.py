@@ -400,8 +400,8 @@ class Turns:
         return (steps + half) % self._wrap - half
 
 
-# Steps that differ by a smaller part than this are of one trigger each; so many of them in a row
-# are no chance of encoder noise. A step of several is a whole multiple but for the last part.
+# Relative difference below which successive steps are equal, the number of equal steps that is not
+# due to noise of the encoder, and the largest deviation of a step from a whole multiple of them.
 _STEADY_PART, _STEADY_STEPS, _WHOLE_PART = 1 / 8, 32, 1 / 4
 _NO_WRAP = 1 << 62
 

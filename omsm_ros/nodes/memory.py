@@ -26,7 +26,7 @@ def use_single_malloc_arena(held_back: Collection[signal.Signals] = ()) -> None:
     start of a process, so this process executes itself again, unless it is set. Signals
     ``held_back`` are blocked until then.
     """
-    mallopt = _of_glibc("mallopt")
+    mallopt = _from_glibc("mallopt")
     if mallopt is None:
         return
     mallopt(_M_ARENA_MAX, 1)
@@ -60,12 +60,12 @@ def return_free_memory() -> None:
     cycles, and up to 2000 empty tuples of each length, let a node grow for hours.
     """
     gc.collect()
-    trim = _of_glibc("malloc_trim")
+    trim = _from_glibc("malloc_trim")
     if trim is not None:
         trim(0)
 
 
-def _of_glibc(name: str) -> Any:
+def _from_glibc(name: str) -> Any:
     import ctypes  # here, because signals are not handled while this module loads
 
     return getattr(ctypes.CDLL(None), name, None)

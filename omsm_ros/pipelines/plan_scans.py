@@ -127,10 +127,10 @@ def write_scans(
 ) -> dict[str, Any]:
     """Write scan_N.csv (time_s, x_m, z_m, c_rad) and scan_N.nc (G-code) of each design.
 
-    bound: on the distance of the executed path from the surface [m];  cycle: of the servo [s]
+    Return the bound, the files, and figures of each path: error [m], rms [m], segment [s],
+    acceleration of C [rad/s²]; points on the part, if its aperture is known.
 
-    Return the bound, the files, and of each path its error [m], rms [m], segment [s], acceleration
-    of C [rad/s²], and its points on the part where the aperture is known.
+    bound: on the distance of the executed path from the surface [m];  cycle: of the servo [s]
     """
     paths, files = [], []
     for k, design in enumerate(designs):

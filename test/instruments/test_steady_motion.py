@@ -12,7 +12,7 @@ from omsm_ros.instruments.scaling import AxisScaling
 PERIOD = 1e-3
 UPTIME_S = 123_456.0  # of the host, from which its monotonic clock counts
 EPOCH_NS = 1_700_000_000 * 10**9
-HIDDEN = 100_003
+MODULUS = 100_003
 """Axis B has the number of the trigger times 7919, modulo this: its steps are not even for long."""
 
 
@@ -44,12 +44,12 @@ def moved(
                 samples = np.zeros(len(of), SAMPLE)
                 samples["counts"][:, 0] = x[seen[of]]
                 samples["counts"][:, 2] = 0 if z is None else z[seen[of]]
-                samples["counts"][:, 3] = seen[of] * 7919 % HIDDEN
+                samples["counts"][:, 3] = seen[of] * 7919 % MODULUS
                 begins = int(of[0]) - (first if new else 0)
                 runs.append(CountedRun(samples, begins, bool(reset and of[0] == first)))
         for axes_block, _ in cutter.add(runs, EPOCH_NS + round(now * 1e9), UPTIME_S + now):
             assert axes_block is not None
-            true = np.rint(axes_block.b).astype(np.int64) * pow(7919, -1, HIDDEN) % HIDDEN
+            true = np.rint(axes_block.b).astype(np.int64) * pow(7919, -1, MODULUS) % MODULUS
             number = axes_block.first_sample + np.arange(len(true)) + reset * (true >= reset)
             found.append(np.stack([number, true, np.full(len(true), now)]))
     return *(np.concatenate(found, axis=1) if found else np.empty((3, 0))), cutter

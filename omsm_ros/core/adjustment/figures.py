@@ -121,7 +121,7 @@ def form_map(
     covariance += open_changes @ open_changes.T
     every, by_height = _term_fit(solution, places)
     alike = tuple(_resembled(made, covariance, every, by_height, effects or {}))
-    more = np.stack([np.zeros(len(made.height)), *(change for _, change in alike)], axis=1)
+    more = made.open_changes((), alike)
     covariance += more @ more.T
     pv, rms = made.pv_and_rms(np.concatenate([open_changes, more[:, 1:]], axis=1))
     terms, coefficients, term_covariance = _reported(made, doubts)

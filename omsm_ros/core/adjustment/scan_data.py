@@ -268,7 +268,7 @@ def delayed(scan: ScanData, latency: float) -> ScanData:
 
 
 def _rate(time: FloatArray, values: FloatArray, order: int = 1) -> FloatArray:
-    """Return the derivative of ``order`` by time, run by run between gaps."""
+    """Return the derivative of ``order`` by time, by run between gaps (Savitzky, Golay 1964)."""
     period = float(np.median(np.diff(time)))
     first = np.append(0, np.flatnonzero(np.diff(time) > 1.5 * period) + 1)
     length = np.diff(first, append=len(time))

@@ -464,7 +464,7 @@ def _smooth(map_: DeviationMap, disc: Aperture) -> ZernikeFit:
         if most and chi_square > free + _CHANCE * np.sqrt(2 * free):
             break
         next_ = terms if most else []
-    # What noise hides of the next orders is least certain at the rim, as their covariance tells.
+    # An undetected form of the next orders is largest at the rim; their covariance bounds it.
     terms = next_ or terms
     points, known = (map_.x, map_.y, map_.deviation), slice(len(terms))
     sums = gram[known, known], right[known, np.newaxis]

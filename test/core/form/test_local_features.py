@@ -225,7 +225,7 @@ def test_the_apex_of_a_cone_between_the_points_belongs_to_the_figure(off):
     assert whole.uncertainty < 0.12 * height
 
 
-def test_terms_that_noise_hides_belong_to_the_uncertainty_at_a_corner():
+def test_undetected_terms_belong_to_the_uncertainty_at_a_corner():
     """Form of orders 5 to 8 that no test shows is highest where the rim meets a missing sector."""
     share, off = np.linspace(1, 0, 20_000), []
     turn, outline = 2 * np.pi * 60 * share, Aperture(R)
