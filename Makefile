@@ -27,8 +27,9 @@ setup: $(PACKAGE)
 demo: setup
 	$(RUN) $(if $(CONTROLLER),python config/$(CONTROLLER)/demo.py out/$(CONTROLLER),omsm demo --out out/demo) $(if $(DEVICE),--device $(DEVICE)) $(if $(VIEW),--view)
 
-# Three processes, a file each, in the order of test/conftest.py; JOBS=0 for one after the other.
-JOBS ?= 3
+# A process more than cores, since files with nodes mostly wait, and a file each, in the order of
+# test/conftest.py; JOBS=0 for one after the other.
+JOBS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$((n < 7 ? n + 1 : 8)))
 PYTEST = $(RUN) python -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 test: compiled lint
 	$(PYTEST)

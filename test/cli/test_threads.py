@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from soaked import soaked
 
 _WORK = """
 import os
@@ -19,7 +20,7 @@ print(len(os.listdir("/proc/self/task")), os.environ["OMP_NUM_THREADS"])
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are counted by Linux")
-@pytest.mark.parametrize("asked", [None, "2"])
+@pytest.mark.parametrize("asked", [None, *soaked("2")])
 def test_a_command_has_one_thread_unless_more_are_asked_for(tmp_path, asked):
     threads = {"OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"}
     environment = {name: value for name, value in os.environ.items() if name not in threads}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from soaked import always
 
 from omsm_ros.instruments.counting import SAMPLE, Counting, Samples, SequenceTracker
 
@@ -158,9 +159,18 @@ def still(count: int, number: int, taken: int = 0) -> Samples:
     return made
 
 
-@pytest.mark.parametrize("number", [0, 512])
-@pytest.mark.parametrize("period", [0.0, 1e-3])
-@pytest.mark.parametrize(("modulus", "timed"), [(2**16, True), (4, True), (4, False)])
+@pytest.mark.parametrize(
+    ("modulus", "timed", "period", "number"),
+    always(
+        (2**16, True, 1e-3, 0), (4, True, 0.0, 0), (4, False, 1e-3, 512),
+        of=[
+            (*counter, period, number)
+            for counter in ((2**16, True), (4, True), (4, False))
+            for period in (0.0, 1e-3)
+            for number in (0, 512)
+        ],
+    ),
+)  # fmt: skip
 def test_a_counter_that_stands_still_is_no_restart(
     modulus: int, timed: bool, period: float, number: int
 ) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from soaked import always
 
 from omsm_ros.errors import DeviceError
 from omsm_ros.instruments.emulator import AXIS_SCALING
@@ -110,7 +111,7 @@ NOISE = np.random.default_rng(5)
 BAUD = np.array([0, 0xF8, 0xFE, 0x80, 0xE0, 0x1E, 0x66, 0x9E, 0xFF], np.uint8)
 
 
-@pytest.mark.parametrize("trigger", ["free_run", "each"])
+@pytest.mark.parametrize("trigger", always("each", of=["free_run", "each"]))
 @pytest.mark.parametrize("values", [("distance",), ("distance", "counter")])
 @pytest.mark.parametrize("noise", [np.arange(256, dtype=np.uint8), BAUD])
 def test_noise_is_no_sample(bench: Any, noise: Any, values: Any, trigger: str) -> None:

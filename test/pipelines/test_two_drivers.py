@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from soaked import soaked
 
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.surface_points import join_points
@@ -67,7 +68,7 @@ def corrected(path, calibration):
 
 
 @pytest.mark.parametrize("lost", [{"axes": [], "distance": []}, LOST], ids=["whole", "lost"])
-@pytest.mark.parametrize("lengths", [(100, 100), (64, 100), (250, 37)])
+@pytest.mark.parametrize("lengths", [(250, 37), *soaked(((100, 100),), ((64, 100),))])
 def test_points_and_accounts_do_not_depend_on_how_drivers_cut_their_streams(
     tmp_path, small_scan_blocks, true_calibration, lengths, lost
 ):

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from soaked import always
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.motion_filter import (
@@ -61,7 +62,7 @@ def test_axes_pass_unless_the_lag_is_latency() -> None:
     assert np.allclose(late.values[[X, Y, B, C]], delayed, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("length", [1, 2, 7, 50, 400])
+@pytest.mark.parametrize("length", always(7, 400, of=[1, 2, 7, 50, 400]))
 @pytest.mark.parametrize("least", [0.0, -np.pi])
 @pytest.mark.parametrize("speed", [300.0, -300.0, 2 * np.pi * 1000])
 def test_a_spindle_that_begins_anew_on_every_turn_is_delayed_alike(

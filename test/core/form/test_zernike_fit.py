@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from soaked import always
 
 from omsm_ros.core.form.zernike_fit import fit_zernikes
 from omsm_ros.core.surface.aperture import Aperture
@@ -156,7 +157,10 @@ def raster(lines, per_line):
 
 @pytest.mark.parametrize(
     ("outline", "sizes"),
-    [("disc", [12.7e-3]), ("ellipse", [12.7e-3, 10.7e-3]), ("rectangle", [9e-3, 8e-3])],
+    always(
+        ("ellipse", [12.7e-3, 10.7e-3]),
+        of=[("disc", [12.7e-3]), ("ellipse", [12.7e-3, 10.7e-3]), ("rectangle", [9e-3, 8e-3])],
+    ),
 )
 def test_form_is_continued_from_the_last_tracks_to_the_outline(outline, sizes):
     """Waves that no term describes, on 150 lines, against a million points."""
