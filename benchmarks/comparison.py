@@ -73,8 +73,8 @@ def rows(full: bool) -> Iterator[Row]:
             c = scanned(folder / "c", other, _FAST, 2 * seed + 1)
             same, _ = compare_measurements(a, b, ComparisonOptions(), None)
             apart, _ = compare_measurements(a, c, ComparisonOptions(), None)
-        alike.append(same.verdict.verdict)
-        added.append(apart.verdict.verdict)
+        alike.append(same.verdict)
+        added.append(apart.verdict)
         figures = same.agreement.figures.values() if same.agreement else ()
         numbers += [abs(n.e_n) for n in figures if n.e_n is not None]
     wrong = alike.count(_DIFFERS) + added.count(_AGREES)

@@ -131,13 +131,13 @@ def vibration_message(
     unknown = [float("nan")] * len(levels.bands)
     line = levels.height_line or (float("nan"), float("nan"))
     low, high = zip(*levels.bands, strict=True)
-    columns = {"low": low, "high": high, "height": levels.effect or unknown}
+    columns = {"low": low, "high": high, "height": levels.height or unknown}
     columns |= {f"rms_{axis}": values for axis, values in levels.rms.items()}
     return messages.make(
         "VibrationLevels",
         header=head,
-        height_total=_known(levels.total_effect),
-        height_noise=_known(levels.noise_effect),
+        height_total=_known(levels.height_total),
+        height_noise=_known(levels.height_noise),
         line_axis=levels.line[0],
         line_frequency=levels.line[1],
         line_amplitude=levels.line[2],

@@ -93,7 +93,7 @@ class VibrationMonitorNode(ManagedNode):
         self._block = len(block) * block.sample_period
         levels = self._levels()
         was = self._alarm.raised
-        if levels is not None and self._alarm.update(levels.total_effect) != was:
+        if levels is not None and self._alarm.update(levels.height_total) != was:
             text = "raised" if self._alarm.raised else "ended"
             self.get_logger().warning(f"vibration alarm {text}: {self._line(levels)}")
         # Once for each spectrum, also with short blocks.
@@ -116,7 +116,7 @@ class VibrationMonitorNode(ManagedNode):
         if levels.height_line is None:
             return f"strongest line {line}"
         return (
-            f"{quantity(levels.total_effect, 'm')} rms on a height, most of it at "
+            f"{quantity(levels.height_total, 'm')} rms on a height, most of it at "
             f"{quantity(levels.height_line[0], 'Hz', 4)}; strongest line {line}"
         )
 
@@ -138,7 +138,7 @@ class VibrationMonitorNode(ManagedNode):
             if self._alarm.raised:
                 report.add(WARN, f"vibration beyond {quantity(self._alarm.limit, 'm')}: "
                                  f"{self._line(levels)}")  # fmt: skip
-            if levels.effect is None:
+            if levels.height is None:
                 report.add(WARN, "effect on a height not evaluated: no calibration yet")
         now = time.monotonic()
         self._flow.update(running.received, now)
@@ -157,15 +157,15 @@ def _figures(levels: Any) -> dict[str, object]:
         band = f"{low:g}_{high:g}_hz"
         for axis in AXES:
             found[f"rms_{axis}_{band}"] = levels.rms[axis][place]
-        if levels.effect is not None:
-            found[f"height_{band}"] = levels.effect[place]
+        if levels.height is not None:
+            found[f"height_{band}"] = levels.height[place]
     axis, frequency, size = levels.line
     found |= {"line_axis": axis, "line_frequency": frequency, "line_amplitude": size}
     if levels.height_line is not None:
         found |= dict(
             zip(("height_line_frequency", "height_line_amplitude"), levels.height_line, strict=True)
         )
-    return found | {"height": levels.total_effect}
+    return found | {"height": levels.height_total}
 
 
 def _edges(text: str) -> tuple[float, ...]:

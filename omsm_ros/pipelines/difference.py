@@ -158,9 +158,9 @@ def facts_of(found: Comparison) -> dict[str, Any]:
     figures = agreement.figures if agreement is not None else figures_of(matched)
     return {
         "schema": "omsm-difference/1",
-        "verdict": found.verdict.verdict,
-        "reasons": [*map(str, found.verdict.reasons)],
-        "reservations": [*map(str, found.verdict.reservations)],
+        "verdict": found.verdict,
+        "reasons": [*map(str, found.reasons)],
+        "reservations": [*map(str, found.reservations)],
         "a": _side(found.sides[0]),
         "b": _side(found.sides[1]),
         "difference": {

@@ -48,14 +48,15 @@ def test_vibration_has_a_level_for_each_band_and_nan_without_a_calibration():
     levels = VibrationLevels(
         bands=((5.0, 50.0), (50.0, 500.0)),
         rms=dict.fromkeys("xyz", (1e-3, 2e-3)),
-        line=("z", 79.0, 3e-3), effect=None, total_effect=None, windows=4,
+        line=("z", 79.0, 3e-3), height=None, height_total=None, height_noise=None,
+        windows=4, height_line=None,
     )  # fmt: skip
     message = figures.vibration_message(MESSAGES, levels, False, 20e-9, header(MESSAGES, 0, "p"))
     assert (list(message.low), list(message.high)) == ([5.0, 50.0], [50.0, 500.0])
     assert list(message.rms_z) == [1e-3, 2e-3]
     unknown = [*message.height, message.height_total, message.height_noise]
     assert all(map(math.isnan, unknown))
-    known = replace(levels, effect=(1e-9, 2e-9), total_effect=3e-9, noise_effect=4e-9)
+    known = replace(levels, height=(1e-9, 2e-9), height_total=3e-9, height_noise=4e-9)
     message = figures.vibration_message(MESSAGES, known, False, 20e-9, message.header)
     assert (message.height_total, message.height_noise) == (3e-9, 4e-9)
     assert message.header.frame_id == "p"

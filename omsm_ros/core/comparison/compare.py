@@ -11,7 +11,7 @@ from omsm_ros.core.comparison.agreement import (
     judge,
     root_mean_square,
 )
-from omsm_ros.core.comparison.matching import SEATED, Matched, match
+from omsm_ros.core.comparison.matching import LATERAL, SEATED, Matched, match
 from omsm_ros.core.comparison.resampling import LocalQuadratic, cell_side, occupied
 from omsm_ros.core.comparison.stated_errors import (
     ESTIMATED,
@@ -45,27 +45,13 @@ _MOST_PLACES = (MOST_ACROSS + 1) ** 2
 _CORRELATED_SHARE = 0.5
 
 
-@dataclass(frozen=True, slots=True)
-class ComparisonVerdict:
-    """Verdict of a comparison.
-
-    verdict: AGREE, DIFFER or CANNOT_TELL;  reasons: the most important first
-    reservations: assumptions in addition to the stated uncertainties
-    """
-
-    verdict: str
-    reasons: tuple[Notice, ...]
-    reservations: tuple[Notice, ...]
-
-
 def verdict_of(
     matched: Matched,
     agreement: ComparisonAgreement | None,
     unknown: tuple[Notice, ...],
     shared: float,
-    reservations: tuple[Notice, ...],
-) -> ComparisonVerdict:
-    """Return the verdict.
+) -> tuple[str, tuple[Notice, ...]]:
+    """Return AGREE, DIFFER or CANNOT_TELL, and the reasons, the most important first.
 
     agreement: None if the uncertainty of a measurement is not known;  unknown: the reasons
     shared: share of the smaller area that both cover
@@ -73,35 +59,27 @@ def verdict_of(
     if shared < _LEAST_SHARED:
         unknown += (Notice("comparison.small_shared_area", shared=shared, least=_LEAST_SHARED),)
     if agreement is None or shared < _LEAST_SHARED:
-        return ComparisonVerdict(CANNOT_TELL, unknown, reservations)
-    differs = _differences(agreement)
-    if differs:
-        return ComparisonVerdict(DIFFER, differs, reservations)
-    doubts = _undecided(matched, agreement)
-    if doubts:
-        return ComparisonVerdict(CANNOT_TELL, doubts, reservations)
+        return CANNOT_TELL, unknown
+    if differs := _differences(agreement):
+        return DIFFER, differs
+    if doubts := _undecided(matched, agreement):
+        return CANNOT_TELL, doubts
     largest = agreement.largest
-    return ComparisonVerdict(
-        AGREE,
-        (
-            Notice(
-                "comparison.largest_term",
-                count=len(agreement.terms),
-                e_n=abs(largest.e_n),
-                term=(largest.n, largest.m),
-            ),
-            Notice("comparison.probability", p=agreement.probability),
-            Notice("comparison.area_within", share=agreement.within),
-            Notice("comparison.undetected", terms=_least_certain(agreement)),
-        ),
-        reservations,
+    least_certain = sorted(agreement.terms, key=lambda term: -term.expanded)[:3]
+    undetected = tuple(
+        Notice("comparison.expanded_of_term", expanded=t.expanded, term=(t.n, t.m))
+        for t in least_certain
     )
-
-
-def _least_certain(found: ComparisonAgreement) -> tuple[Notice, ...]:
-    terms = sorted(found.terms, key=lambda term: -term.expanded)[:3]
-    return tuple(
-        Notice("comparison.expanded_of_term", expanded=t.expanded, term=(t.n, t.m)) for t in terms
+    return AGREE, (
+        Notice(
+            "comparison.largest_term",
+            count=len(agreement.terms),
+            e_n=abs(largest.e_n),
+            term=(largest.n, largest.m),
+        ),
+        Notice("comparison.probability", p=agreement.probability),
+        Notice("comparison.area_within", share=agreement.within),
+        Notice("comparison.undetected", terms=undetected),
     )
 
 
@@ -185,6 +163,8 @@ class Comparison:
     shared: share of the smaller area that both cover
     length: correlation length of errors of unknown form [m]
     common: sources of an error that both have in common
+    verdict: AGREE, DIFFER or CANNOT_TELL;  reasons: the most important first
+    reservations: assumptions in addition to the stated uncertainties
     """
 
     matched: Matched
@@ -193,7 +173,9 @@ class Comparison:
     shared: float
     length: float
     common: tuple[str, ...]
-    verdict: ComparisonVerdict
+    verdict: str
+    reasons: tuple[Notice, ...]
+    reservations: tuple[Notice, ...]
 
 
 def compare_measurements_of_part(
@@ -235,7 +217,7 @@ def compare_measurements_of_part(
     sides = (_side(halves[0], one, agreement), _side(halves[1], other, agreement))
     own = min(occupied(half.points.x, half.points.y, side) for half in (a, b))
     shared = min(float(np.sum(matched.filled)) / own, 1.0)
-    reservations = _reservations(sides, matched)
+    verdict, reasons = verdict_of(matched, agreement, unknown, shared)
     return Comparison(
         matched=matched,
         sides=sides,
@@ -243,7 +225,9 @@ def compare_measurements_of_part(
         shared=shared,
         length=reach,
         common=common,
-        verdict=verdict_of(matched, agreement, unknown, shared, reservations),
+        verdict=verdict,
+        reasons=reasons,
+        reservations=_reservations(sides, matched),
     )
 
 
@@ -293,9 +277,8 @@ def _reservations(sides: tuple[SideSummary, SideSummary], matched: Matched) -> t
     drifts = [side.drift for side in sides if side.drift_from == ESTIMATED]
     if any(drifts):
         found = (Notice("comparison.drift_estimated", drift=max(drifts)),)
-    lateral_dofs = [name for name in ("x", "y", "clocking") if name in matched.dofs]
-    if lateral_dofs:
-        found += (Notice("comparison.moves_fitted", names=lateral_dofs),)
+    if fitted := [name for name in LATERAL if name in matched.dofs]:
+        found += (Notice("comparison.moves_fitted", names=fitted),)
     found += _lateral_shift(matched)
     return found + tuple(
         Notice("comparison.not_fitted", name=name, reason=why)

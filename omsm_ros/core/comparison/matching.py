@@ -22,7 +22,7 @@ MATCHING_PARAMETERS = ("piston", "tip", "tilt", "power", "x", "y", "clocking")
 lowers the side of +x, clocking turns from x towards y."""
 
 SEATED = ("piston", "tip", "tilt")
-_LATERAL = ("x", "y", "clocking")
+LATERAL = ("x", "y", "clocking")
 # Convergence is quadratic; resampling does not resolve a thousandth of a place.
 _TURNS = 8
 _SETTLED = 1e-3
@@ -125,7 +125,7 @@ def match(a: LocalQuadratic, b: LocalQuadratic, grid: HeightGrid, dofs: Sequence
     for _ in range(_TURNS):
         seen = _resampled(here, b, grid, moved)
         step = seen.step()
-        lateral_step = {name: step.pop(name) for name in _LATERAL if name in step}
+        lateral_step = {name: step.pop(name) for name in LATERAL if name in step}
         reach = {"x": grid.dx, "y": grid.dx, "clocking": 2 * grid.dx / float(np.ptp(x))}
         if all(abs(value) < _SETTLED * reach[name] for name, value in lateral_step.items()):
             return replace(seen.levelled(step), refused=refused)
@@ -188,7 +188,7 @@ def _not_determined(
     surface; the rest is noise of the slopes.
     """
     refused: dict[str, Notice] = {}
-    for name in _LATERAL:
+    for name in LATERAL:
         if name not in columns:
             continue
         others = [n for n in columns if n != name and n not in refused]

@@ -1,7 +1,7 @@
 """Lines and levels of measured acceleration, and the height error that they may cause."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -87,10 +87,9 @@ def acceleration_lines(period: float, axes: dict[str, FloatArray]) -> Accelerati
     found: list[AccelerationLine] = []
     for axis, values in axes.items():
         found += _lines(period, axis, values)
-    found.sort(key=lambda line: -line.acceleration)
     kept: list[AccelerationLine] = []
     duration = period * max(map(len, axes.values()))
-    for line in found:
+    for line in sorted(found, key=lambda line: -line.acceleration):
         if all(abs(line.frequency - other.frequency) > 1.0 / duration for other in kept):
             kept.append(line)
     return AccelerationLines(lines=tuple(kept), highest=0.5 / period, duration=duration)
@@ -123,40 +122,29 @@ class VibrationLevels:
 
     bands: (from, to) [Hz];  rms: of each axis [m/s²], one value for each band
     line: strongest of all axes: axis, frequency [Hz], amplitude [m/s²]
-    effect: rms effect on the height for each band [m], without the white noise of the sensor; None
+    height: rms effect on the height for each band [m], without the white noise of the sensor; None
         if unknown
-    total_effect: of all bands [m];  windows: number averaged so far
-    noise_effect: what the noise of the sensor would be in all bands, and hides [m]
+    height_total: of all bands [m];  windows: number averaged so far
+    height_noise: what the noise of the sensor would be in all bands, and hides [m]
     height_line: strongest line in the height: frequency [Hz], amplitude [m]
     """
 
     bands: tuple[tuple[float, float], ...]
     rms: dict[str, tuple[float, ...]]
     line: tuple[str, float, float]
-    effect: tuple[float, ...] | None
-    total_effect: float | None
+    height: tuple[float, ...] | None
+    height_total: float | None
+    height_noise: float | None
     windows: int
-    noise_effect: float | None = None
-    height_line: tuple[float, float] | None = None
+    height_line: tuple[float, float] | None
 
     def entry(self) -> dict[str, Any]:
-        """Return JSON values in SI units, with the effect by band as ``height``."""
-        axis, frequency, amplitude = self.line
-        return {
-            "bands": [list(band) for band in self.bands],
-            "rms": {axis: list(levels) for axis, levels in self.rms.items()},
-            "line": {"axis": axis, "frequency": frequency, "amplitude": amplitude},
-            "height": None if self.effect is None else list(self.effect),
-            "height_total": self.total_effect,
-            "height_noise": self.noise_effect,
-            "windows": self.windows,
-        } | (
-            {}
-            if self.height_line is None
-            else {
-                "height_line": dict(zip(("frequency", "amplitude"), self.height_line, strict=True))
-            }
-        )
+        """Return JSON values in SI units, without ``height_line`` where there is none."""
+        names = ("axis", "frequency", "amplitude")
+        found = asdict(self) | {"line": dict(zip(names, self.line, strict=True))}
+        if (line := found.pop("height_line")) is not None:
+            found["height_line"] = dict(zip(names[1:], line, strict=True))
+        return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,25 +201,17 @@ class RunningSpectrum:
         self.received += len(block)
         if block.first_sample != self._next or block.sample_period != self._period:
             self.restarts += self._next >= 0
-            self._begin(block)
+            self._held = np.empty((3, 0))
+            if block.sample_period != self._period:
+                self._period, self._mean, self._windows = block.sample_period, {}, 0
         self._next = block.end
         values = np.array([block.x, block.y, block.z], np.float64)
         self.lost += int(np.count_nonzero(~np.isfinite(values).all(axis=0)))
         self._held = np.hstack([self._held, values])
-        size = self._size
+        size = max(round(self.options.window / self._period), 2 * _LEAST_RESOLUTIONS)
         while self._held.shape[1] >= size:
             self._add(self._held[:, :size])
             self._held = self._held[:, size // 2 :]
-
-    @property
-    def _size(self) -> int:
-        return max(round(self.options.window / self._period), 2 * _LEAST_RESOLUTIONS)
-
-    def _begin(self, block: AccelerationBlock) -> None:
-        self._held = np.empty((3, 0))
-        if block.sample_period != self._period:
-            self._mean, self._windows = {}, 0
-        self._period = block.sample_period
 
     def _add(self, window: FloatArray) -> None:
         if not np.isfinite(window).all():
@@ -275,10 +255,10 @@ class RunningSpectrum:
                 ((axis, *_strongest(spectrum, bands)) for axis, spectrum in self._mean.items()),
                 key=lambda line: line[2],
             ),
-            effect=effect,
-            total_effect=total,
+            height=effect,
+            height_total=total,
+            height_noise=noise,
             windows=self._windows,
-            noise_effect=noise,
             height_line=line,
         )
 
@@ -328,14 +308,12 @@ class RunningSpectrum:
 
     def _height_share(self, response: TransferFunction | None) -> FloatArray | None:
         """Return the square of height over acceleration by frequency, None if it is unknown."""
-        seen = self.options.mount == SLIDE
-        if seen and response is None:
-            return None
-        spectrum = self._mean[self.options.axis]
-        omega = 2 * np.pi * np.maximum(spectrum.frequency, spectrum.step)
-        share = np.ones(len(omega))
-        if seen and response is not None:
+        spectrum, share = self._mean[self.options.axis], np.ones(1)
+        if self.options.mount == SLIDE:
+            if response is None:
+                return None
             share = np.abs(1 - response.response(spectrum.frequency))
+        omega = 2 * np.pi * np.maximum(spectrum.frequency, spectrum.step)
         return np.asarray((share / omega**2) ** 2)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import scipy  # whose parts are loaded when they are used
 from numpy.typing import ArrayLike
 
+from omsm_ros.core.lti.discretisation import DigitalFilter
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.errors import ConfigurationError, DataError
 
@@ -116,11 +117,15 @@ def band_stop(
     frequency = np.linspace(0.0, 0.5 / period, len(response))
     settling = 0.0
     for low, high in bands:
-        sections = _sections(low, high, period)
-        kept = scipy.signal.sosfiltfilt(sections, kept, padlen=min(count - 1, _padding(sections)))
+        if not 0 < low < high < frequency[-1]:
+            raise ConfigurationError("ripple.stop_band", low=low, high=high, nyquist=frequency[-1])
+        sections = scipy.signal.butter(_ORDER, (low, high), "bandstop", fs=1 / period, output="sos")
+        slowest = float(np.max(abs(DigitalFilter(sections, period).poles)))
+        padding = int(np.ceil(np.log(_RUNG_OUT) / np.log(min(slowest, 1 - 1e-9))))
+        kept = scipy.signal.sosfiltfilt(sections, kept, padlen=min(count - 1, padding))
         one = scipy.signal.freqz_sos(sections, 2 * np.pi * frequency * period)[1]
         response = response * abs(one) ** 2
-        settling = max(settling, _padding(sections) * period)
+        settling = max(settling, padding * period)
     removed = (even - kept)[sample - sample[0]]
     return BandStopped(
         removed=removed,
@@ -130,22 +135,6 @@ def band_stop(
         frequency=frequency,
         response=response,
     )
-
-
-def _sections(low: float, high: float, period: float) -> FloatArray:
-    nyquist = 0.5 / period
-    if not 0 < low < high < nyquist:
-        raise ConfigurationError("ripple.stop_band", low=low, high=high, nyquist=nyquist)
-    return np.asarray(
-        scipy.signal.butter(_ORDER, (low, high), "bandstop", fs=1 / period, output="sos")
-    )
-
-
-def _padding(sections: FloatArray) -> int:
-    """Return the number of samples of the transient, from the slowest pole."""
-    poles = np.concatenate([np.roots(section[3:]) for section in sections])
-    slowest = float(np.max(abs(poles)))
-    return int(np.ceil(np.log(_RUNG_OUT) / np.log(min(slowest, 1 - 1e-9))))
 
 
 def noise_floor(power: FloatArray, oversampling: int = 1) -> FloatArray:

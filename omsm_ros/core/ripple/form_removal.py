@@ -235,11 +235,7 @@ def _orthogonal(signal: ScanSignal, some: np.ndarray, every: bool) -> tuple[Floa
 
 
 def _normal_equations(
-    basis: _Basis,
-    signal: ScanSignal,
-    values: FloatArray,
-    chosen: np.ndarray,
-    waves: Waves | None = None,
+    basis: _Basis, signal: ScanSignal, values: FloatArray, chosen: np.ndarray, waves: Waves | None
 ) -> tuple[FloatArray, FloatArray]:
     products = []
     for first in range(0, len(chosen), _CHUNK):

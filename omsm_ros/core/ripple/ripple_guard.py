@@ -16,7 +16,7 @@ from omsm_ros.core.ripple.coordinates import Coordinate
 from omsm_ros.core.ripple.density import aliased_frequency, significance
 from omsm_ros.core.ripple.form_removal import FormFit, FormRemoved, SpindleOrder
 from omsm_ros.core.ripple.lines import LEAST_SIGMA, LineSpectrum, find_lines, further_lines
-from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
+from omsm_ros.core.ripple.scan_signal import PATH, TIME, TURN, ScanSignal
 from omsm_ros.core.ripple.source_hypotheses import (
     ALIASED,
     ARTEFACT,
@@ -238,17 +238,12 @@ def _named(done: Attribution, key: Key, evidence: LineEvidence) -> NamedLine:
 def _by_other_scans(done: Attribution, key: Key, source: SourceHypothesis) -> NamedLine:
     scans, line = done.scans, done.evidence[key].line
     names = [scans[own].signal.name for own, _ in source.partners]
-    if source.kind == PART:
-        code = "ripple.same_wavelength_on_path"
-        if source.coordinate == RADIUS:
-            code = "ripple.same_wavelength_on_radius"
-        text = Notice(code, scans=names)
-        return NamedLine(line=line, kind=PART, evidence=(text,), wavelength=1 / source.frequency)
-    if source.kind == ARTEFACT:
-        text = Notice("ripple.aliased_texture", scans=names, wavelength=1 / source.frequency)
-        return NamedLine(
-            line=line, kind=ARTEFACT, evidence=(text,), wavelength=1 / source.frequency
-        )
+    if source.kind in (PART, ARTEFACT):
+        code, wavelength = "ripple.aliased_texture", 1 / source.frequency
+        if source.kind == PART:
+            code = f"ripple.same_wavelength_on_{source.coordinate}"
+        text = Notice(code, scans=names, wavelength=wavelength)
+        return NamedLine(line=line, kind=source.kind, evidence=(text,), wavelength=wavelength)
     if source.kind == SYNCHRONOUS:
         order = round(source.frequency)
         texts = [Notice("ripple.same_order", order=order, scans=names)]

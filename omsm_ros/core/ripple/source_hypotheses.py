@@ -268,30 +268,26 @@ def attribution_evidence(scans: Sequence[StudiedScan]) -> dict[Key, LineEvidence
     sources = {key: _sources(scans, tested[key]) for key in keys}
     images = _images(scans, sources)
     return {
-        key: LineEvidence(_line(scans, key), tested[key], (*sources[key], *images.get(key, ())))
-        for key in keys
+        (own, k): LineEvidence(
+            scans[own].lines[k], tested[own, k], (*sources[own, k], *images.get((own, k), ()))
+        )
+        for own, k in keys
     }
 
 
-def _line(scans: Sequence[StudiedScan], key: Key) -> SpectralLine:
-    return scans[key[0]].lines[key[1]]
-
-
 def _tests(scans: Sequence[StudiedScan], key: Key) -> Iterator[SourceHypothesis]:
-    own, line = key[0], _line(scans, key)
+    own, line = key[0], scans[key[0]].lines[key[1]]
     for hypothesis in hypotheses_of(scans[own], line):
         present, absent = [], []
         for other, scan in enumerate(scans):
             if other == own or (hypothesis.kind == PART and not _same_part(scans[own], scan)):
                 continue
             shown = is_detected(scan, hypothesis, line.amplitude)
-            if shown:
-                place = place_in(scan, hypothesis)
-                if place is not None:
-                    found = lines_at(scan, place)
-                    index = next(k for k, one in enumerate(scan.lines) if one is found)
-                    present.append((other, index))
-            elif shown is not None:
+            if shown and (place := place_in(scan, hypothesis)) is not None:
+                found = lines_at(scan, place)
+                index = next(k for k, one in enumerate(scan.lines) if one is found)
+                present.append((other, index))
+            elif shown is False:
                 absent.append(other)
         yield replace(hypothesis, partners=tuple(present), absent=tuple(absent))
 
@@ -309,7 +305,11 @@ def _sources(
     alive = [t for t in tested if t.alive]
     found = []
     for one in alive:
-        rivals = [t for t in alive if _is_rival(one, t)]
+        # On circles of one radius form of the part repeats as a spindle error does.
+        rivals = [
+            t for t in alive if t.kind != one.kind and not t.alias_count
+            and not (one.kind == SYNCHRONOUS and t.coordinate == PATH)
+        ]  # fmt: skip
         decisive = tuple(
             key
             for key in one.partners
@@ -322,13 +322,6 @@ def _sources(
     shaken = [c for c in found if c.kind == VIBRATION]
     best = sorted(shaken, key=lambda c: (-len(c.partners), c.frequency))[:1]
     return (*[c for c in found if c.kind != VIBRATION], *best)
-
-
-def _is_rival(one: SourceHypothesis, other: SourceHypothesis) -> bool:
-    """Return True for another kind that needs no aliasing."""
-    if one.kind == SYNCHRONOUS and other.coordinate == PATH:
-        return False  # on circles of one radius form of the part repeats in the same way
-    return one.kind != other.kind and not other.alias_count
 
 
 def _images(

@@ -81,13 +81,17 @@ def remove_vibrations(
     found: list[RemovedVibration] = []
     bands: list[tuple[float, float]] = []
     others, clock = _other_lines(scan), None
+    # Below it heights may be form of the part.
+    lowest = LEAST_WAVES * scan.resolution(TIME)
+    if (turn := scan.coordinates.get(TURN)) is not None:
+        lowest = max(lowest, (HIGHEST_ORDER + 0.5) * turn.pace)
     left = {axis: np.concatenate([getattr(block, axis) for block in run]) for axis in "xyz"}
     for line in scan.acceleration_lines.lines:
         seen = float(aliased_frequency(line.frequency, scan.signal.rate))
         if any(abs(line.frequency - at) <= half for at, half in bands):
             continue
-        if outcome := _other_source(scan, line.frequency, seen):
-            found.append(RemovedVibration(frequency=line.frequency, apparent=seen, outcome=outcome))
+        if min(line.frequency, seen) < lowest:
+            found.append(RemovedVibration(frequency=line.frequency, apparent=seen, outcome=FORM))
             continue
         envelope, half = _envelope(taken, left[line.axis], line.frequency)
         bands.append((line.frequency, half))
@@ -117,18 +121,6 @@ def _other_lines(scan: StudiedScan) -> FloatArray:
         if all(abs(line.possible.get(TIME, np.inf) - at) > reach for at, reach in images)
     ]  # fmt: skip
     return sum_of(others, scan.coordinates, len(scan.signal))
-
-
-def _other_source(scan: StudiedScan, frequency: float, seen: float) -> str:
-    """Return FORM if heights at this frequency may be form of the part, else ""."""
-    turn = scan.coordinates.get(TURN)
-    near = LEAST_WAVES * scan.resolution(TIME)
-    for place in (frequency, seen):
-        if turn is not None and place < (HIGHEST_ORDER + 0.5) * turn.pace:
-            return FORM
-        if place < near:
-            return FORM
-    return ""
 
 
 def _envelope(time: FloatArray, values: FloatArray, frequency: float) -> tuple[ComplexArray, float]:

@@ -132,11 +132,11 @@ class TestLevels:
         moved = 1e-6 * np.sin(2 * np.pi * 50 * time) * (2 * np.pi * 50) ** 2
         columns = np.array([moved, 0 * time, 0 * time])
         along = self.running(columns, axis="x").levels()
-        assert along.total_effect == pytest.approx(1e-6 / 2**0.5, rel=0.01)
+        assert along.height_total == pytest.approx(1e-6 / 2**0.5, rel=0.01)
         assert along.height_line == (pytest.approx(50.0), pytest.approx(1e-6, rel=0.01))
-        assert self.running(columns).levels().total_effect < 1e-12
-        total = np.sqrt(np.sum(np.square(along.effect)))
-        assert along.total_effect == pytest.approx(total)
+        assert self.running(columns).levels().height_total < 1e-12
+        total = np.sqrt(np.sum(np.square(along.height)))
+        assert along.height_total == pytest.approx(total)
 
     def test_what_lies_below_the_first_band_is_in_none(self):
         time = np.arange(6000) / RATE

@@ -48,25 +48,25 @@ def test_a_line_has_its_level_in_its_band_and_on_its_axis():
 def test_what_the_encoder_does_not_see_moves_the_height_by_its_motion():
     """a/ω²: 5 nm at 680 Hz are 0.0913 m/s²."""
     levels = fed(shaken(680.0, 5e-9 * (2 * np.pi * 680) ** 2)).levels()
-    assert levels.total_effect == pytest.approx(5e-9 / 2**0.5, rel=0.01)
-    assert levels.effect[3] == pytest.approx(levels.total_effect, rel=1e-3)
+    assert levels.height_total == pytest.approx(5e-9 / 2**0.5, rel=0.01)
+    assert levels.height[3] == pytest.approx(levels.height_total, rel=1e-3)
 
 
 @pytest.mark.parametrize("frequency", [30.0, 100.0, 300.0])
 def test_what_the_encoder_sees_moves_it_by_what_the_response_lacks(frequency):
     moved = 10e-9
     running = fed(shaken(frequency, moved * (2 * np.pi * frequency) ** 2), mount=SLIDE)
-    assert running.levels().effect is None
+    assert running.levels().height is None
     lacks = abs(1 - PAPER_DYNAMICS.response([frequency])[0])
     levels = running.levels(PAPER_DYNAMICS)
-    assert levels.total_effect == pytest.approx(moved * lacks / 2**0.5, rel=0.03)
+    assert levels.height_total == pytest.approx(moved * lacks / 2**0.5, rel=0.03)
 
 
 @pytest.mark.parametrize("frequency", [50.0, 150.0, 500.0])
 def test_a_line_on_the_edge_of_two_bands_counts_once(frequency):
     """Mains at 50 Hz lies on an edge of the bands that are set by default."""
     levels = fed(shaken(frequency, 10e-9 * (2 * np.pi * frequency) ** 2)).levels()
-    assert levels.total_effect == pytest.approx(10e-9 / 2**0.5, rel=0.01)
+    assert levels.height_total == pytest.approx(10e-9 / 2**0.5, rel=0.01)
     total = np.sqrt(np.sum(np.square(levels.rms["z"])))
     assert total == pytest.approx(10e-9 * (2 * np.pi * frequency) ** 2 / 2**0.5, rel=1e-3)
 
@@ -111,15 +111,15 @@ def test_the_noise_of_the_sensor_is_no_vibration(seed):
     random = np.random.default_rng(seed)
     noise = random.normal(0, 0.5e-3 * np.sqrt(RATE / 2 / 45), int(4 * RATE))
     quiet = fed(noise).levels()
-    assert quiet.total_effect == 0.0
+    assert quiet.height_total == 0.0
     f = np.linspace(5, 50, 1000)
     white = np.sqrt(np.trapezoid((0.5e-3) ** 2 / 45 / (2 * np.pi * f) ** 4, f))
-    assert white < quiet.noise_effect < 4 * white
+    assert white < quiet.height_noise < 4 * white
     line = shaken(30.0, 150e-9 * (2 * np.pi * 30) ** 2, seconds=4.0)
-    assert fed(noise + line).levels().total_effect == pytest.approx(150e-9 / 2**0.5, rel=0.15)
+    assert fed(noise + line).levels().height_total == pytest.approx(150e-9 / 2**0.5, rel=0.15)
     fast = shaken(680.0, 20e-9 * (2 * np.pi * 680) ** 2, seconds=4.0)
     levels = fed(noise + fast).levels()
-    assert levels.total_effect == pytest.approx(20e-9 / 2**0.5, rel=0.05)
+    assert levels.height_total == pytest.approx(20e-9 / 2**0.5, rel=0.05)
     assert levels.height_line[0] == pytest.approx(680, abs=1)
 
 
