@@ -158,6 +158,10 @@ class Calibration:
 
     def content(self) -> dict[str, object]:
         """Return the calibration as JSON values, without its id."""
+        further = {
+            "numerators": {name: numerator.tolist() for name, numerator in self.further.items()},
+            "covariance": self.joint.ravel().tolist(),
+        }
         return {
             "schema": SCHEMA,
             "numerator": self.dynamics.numerator.tolist(),
@@ -169,14 +173,7 @@ class Calibration:
             "covariance": self.covariance.ravel().tolist(),
             "settings": dict(self.settings),
             "certificate": self.certificate.content(),
-            **self._further_content(),
-        }
-
-    def _further_content(self) -> dict[str, object]:
-        if not self.further:
-            return {}
-        numerators = {name: numerator.tolist() for name, numerator in self.further.items()}
-        return {FURTHER: {"numerators": numerators, "covariance": self.joint.ravel().tolist()}}
+        } | ({FURTHER: further} if self.further else {})
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Calibration:

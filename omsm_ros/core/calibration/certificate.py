@@ -437,15 +437,10 @@ def _read(kind: Any, content: Any, name: str) -> Any:
     if outer is not None and issubclass(outer, Mapping):
         _check(isinstance(content, Mapping), content, name, "an object")
         return {str(key): _read(inner[1], v, f"{name}.{key}") for key, v in content.items()}
-    _check(_fits(kind, content), content, name, _SCALARS[kind])
+    whole = kind is float and type(content) is int
+    fits = (whole or type(content) is kind) and (kind is not float or math.isfinite(content))
+    _check(fits, content, name, _SCALARS[kind])
     return kind(content)
-
-
-def _fits(kind: type, content: object) -> bool:
-    if kind is float:
-        number = isinstance(content, int | float) and not isinstance(content, bool)
-        return number and math.isfinite(content)  # type: ignore[arg-type]
-    return type(content) is kind
 
 
 def _read_fields(kind: Any, content: Any, name: str) -> Any:

@@ -7,9 +7,9 @@ result is the change and its significance in standard deviations.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.lti.frequency_response import relative_response_jacobian
@@ -26,13 +26,6 @@ _COMPARED_PART = 1 / 3
 _RANK_TOLERANCE = 1e-2
 # Below it a response is the static gain and nothing else.
 _LEAST_BAND_HZ = 0.1
-
-
-def _stats() -> Any:
-    """Return ``scipy.stats``, loaded when it is needed: it takes a second."""
-    from scipy import stats
-
-    return stats
 
 
 @dataclass(frozen=True)
@@ -70,7 +63,7 @@ def compare_calibrations(old: Calibration, new: Calibration) -> CalibrationChang
     gain_change = new.static_gain - old.static_gain
     gain_sigma = math.hypot(*(c.static_gain_uncertainty for c in (old, new)))
     gain_sigmas = abs(gain_change) / gain_sigma if gain_sigma else 0.0
-    p_value = float(_stats().chi2.sf(statistic + gain_sigmas**2, known + (gain_sigma > 0)))
+    p_value = float(scipy.stats.chi2.sf(statistic + gain_sigmas**2, known + (gain_sigma > 0)))
     delay = new.dynamics.low_frequency_delay - old.dynamics.low_frequency_delay
     sigma = math.hypot(*(c.low_frequency_delay_noise for c in (old, new)))
     worst = int(np.argmax(np.abs(ratio)))
@@ -215,7 +208,7 @@ def _chance(off: FloatArray, covariance: FloatArray, static_gain: Spread) -> flo
     statistic, known = sum(value for value, _ in found), found[0][1] * free
     if static_gain.stated:
         statistic, known = statistic + free * static_gain.ratio**2, known + free
-    return float(_stats().chi2.sf(statistic, known))
+    return float(scipy.stats.chi2.sf(statistic, known))
 
 
 # Iglewicz and Hoaglin, How to Detect and Handle Outliers, 1993: 3.5 of the modified z-score.
@@ -271,5 +264,5 @@ def trend(times: FloatArray, values: FloatArray) -> LinearTrend | None:
     if len(known) > _MOST:
         known = known[np.argsort(times[known], kind="stable")]
         known = known[np.linspace(0, len(known) - 1, _MOST).round().astype(np.int64)]
-    found = _stats().theilslopes(values[known], times[known], alpha=0.95)
+    found = scipy.stats.theilslopes(values[known], times[known], alpha=0.95)
     return LinearTrend(float(found.slope), float(found.low_slope), float(found.high_slope))

@@ -80,7 +80,8 @@ def counter_offset(
         raise DataError("correction.few_samples", samples=valid, most=most, least=least)
     # Wider than a minimum, so that there are other offsets to compare with.
     reach = max(most, _FLANK + 1)
-    residual = _residuals(_level(z), np.where(ok, _level(distance, ok), 0.0), ok, reach)
+    level = np.where(ok, distance - float(np.mean(distance[ok])), 0.0)
+    residual = _residuals(z - float(np.mean(z)), level, ok, reach)
     best = reach - most + int(np.argmin(residual[reach - most : reach + most + 1]))
     elsewhere = np.delete(_between(residual), np.s_[max(0, best - _FLANK) : best + _FLANK + 1])
     contrast = float(elsewhere.min() / max(residual[best], np.finfo(float).tiny))
@@ -89,11 +90,6 @@ def counter_offset(
             "correction.several_offsets", ratio=contrast, samples=best - reach, least=_CONTRAST
         )
     return _refined(z, distance, ok, best - reach, lag, lag_uncertainty)
-
-
-def _level(values: FloatArray, ok: NDArray[np.bool_] | None = None) -> FloatArray:
-    """Return the values (n,) without their mean."""
-    return values - float(np.mean(values if ok is None else values[ok]))
 
 
 def _residuals(z: FloatArray, d: FloatArray, ok: NDArray[np.bool_], most: int) -> FloatArray:
@@ -146,9 +142,13 @@ def _refined(
     if not _GAIN[0] < abs(gain) < _GAIN[1]:
         raise DataError("correction.gain", gain=float(gain), least=_GAIN[0], most=_GAIN[1])
     inverse = np.linalg.pinv(columns.T @ columns)
-    # Residuals are correlated, which reduces the number of independent samples.
-    alike = _correlation_length(residual)
-    spread = math.sqrt(float(residual @ residual) / max(len(here) - 4, 1) * alike * inverse[3, 3])
+    total = float(residual @ residual)
+    # Residuals are correlated, which reduces the number of independent samples: by (1 + ρ)/(1 - ρ)
+    # for a first-order process.
+    near = float(residual[1:] @ residual[:-1]) / total if total > 0 else 0.0
+    near = min(max(near, 0.0), 0.999)
+    alike = (1 + near) / (1 - near)
+    spread = math.sqrt(total / max(len(here) - 4, 1) * alike * inverse[3, 3])
     uncertainty = math.hypot(spread / scale[3] / gain, lag_uncertainty)
     # The distance lags Z, which reduces the offset that is found.
     found = samples + moved / gain + lag
@@ -156,14 +156,6 @@ def _refined(
     if abs(found - whole) + _COVERAGE * uncertainty > _ROOM:
         raise DataError("correction.no_whole_offset", samples=float(found), uncertainty=uncertainty)
     return CounterOffset(whole, found - whole, uncertainty, float(gain))
-
-
-def _correlation_length(residual: FloatArray) -> float:
-    """Return the number of samples (≥ 1) for one independent one, by a first-order process."""
-    total = float(residual @ residual)
-    near = float(residual[1:] @ residual[:-1]) / total if total > 0 else 0.0
-    near = min(max(near, 0.0), 0.999)
-    return (1 + near) / (1 - near)
 
 
 def offset_of_motion(

@@ -72,12 +72,11 @@ class MotionFilters:
         """Return the filters of ``calibration`` at ``sample_period`` [s]; lags in seconds."""
         g = calibration.dynamics
 
-        def rate_of(numerator: FloatArray) -> DigitalFilter:
-            rate = np.append(0.0, numerator)
-            return derivative_filter(rate, g.denominator, g.delay, sample_period, g.poles())
-
         def response_of(numerator: FloatArray) -> DigitalFilter:
             return derivative_filter(numerator, g.denominator, g.delay, sample_period, g.poles())
+
+        def rate_of(numerator: FloatArray) -> DigitalFilter:
+            return response_of(np.append(0.0, numerator))
 
         delay = TransferFunction(np.ones(1), np.ones(1), probe_latency)
         noise, undetected = (
@@ -303,11 +302,5 @@ class MotionFilter:
         return SENSITIVITIES + between + sum(bank.outputs - 2 for bank in self._banks)
 
     def _unfiltered(self, run: SampleRun, reason: RejectionReason) -> SampleRun:
-        return SampleRun(
-            run.session,
-            run.first,
-            run.stamp_ns,
-            run.period_ns,
-            np.full(len(run), reason, np.uint8),
-            np.full((self._outputs, len(run)), np.nan),
-        )
+        values = np.full((self._outputs, len(run)), np.nan)
+        return replace(run, reasons=np.full(len(run), reason, np.uint8), values=values)

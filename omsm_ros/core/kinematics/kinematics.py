@@ -36,6 +36,12 @@ class Geometry(CheckedRecord):
     beam_y: float = SLOPE.of_field(0.0)
     abbe_arm: float = LENGTH.of_field(0.0)
 
+    @property
+    def beam(self) -> FloatArray:
+        """Unit vector along the beam at b = 0 (3,)."""
+        beam = np.array([self.beam_x, self.beam_y, 1.0])
+        return np.asarray(beam / np.linalg.norm(beam))
+
 
 class WorkpiecePoints(NamedTuple):
     """Points in the workpiece frame [m], each (n,)."""
@@ -76,8 +82,7 @@ def workpiece_points(
 
 def beam_quaternion(geometry: Geometry) -> tuple[float, float, float, float]:
     """Return the shortest turn (x, y, z, w) of the Z axis onto the beam, at b = 0."""
-    beam = np.array([geometry.beam_x, geometry.beam_y, 1.0])
-    beam /= np.linalg.norm(beam)
+    beam = geometry.beam
     turn = np.array([-beam[1], beam[0], 0.0, 1.0 + beam[2]])
     x, y, z, w = (turn / np.linalg.norm(turn)).tolist()
     return x, y, z, w
@@ -90,9 +95,7 @@ def _reach(
 
     B turns about Y: ``(x, z) -> (x cos b + z sin b, z cos b - x sin b)``.
     """
-    beam = np.array([geometry.beam_x, geometry.beam_y, 1.0])
-    beam /= np.linalg.norm(beam)
-    x, y, z = (distance * component for component in beam)
+    x, y, z = (distance * component for component in geometry.beam)
     if not b.any():
         return x, y, z
     cosine, sine = np.cos(b), np.sin(b)

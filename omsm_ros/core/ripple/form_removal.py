@@ -16,7 +16,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.polynomial import legendre
 
-from omsm_ros.core.ripple.scan_signal import ScanSignal
+from omsm_ros.core.ripple.scan_signal import TURN, ScanSignal
+from omsm_ros.core.ripple.spectral_line import SpectralLine
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, zernike_values
 
@@ -53,24 +54,6 @@ _CIRCLE = 0.02
 _LEAST_DETERMINED = 1e-12
 
 
-@dataclass(frozen=True, slots=True)
-class SpindleOrder:
-    """Harmonic ``cosine · cos(2π order · turn) + sine · sin(…)`` [m] of the spindle.
-
-    uncertainty: standard, of cosine and of sine [m]
-    """
-
-    order: int
-    cosine: float
-    sine: float
-    uncertainty: float
-
-    @property
-    def amplitude(self) -> float:
-        """Amplitude, half of peak to valley [m]."""
-        return float(np.hypot(self.cosine, self.sine))
-
-
 @dataclass(frozen=True, eq=False)
 class FormRemoved:
     """Scan without its form.
@@ -83,7 +66,7 @@ class FormRemoved:
     residual: FloatArray
     degree: int
     removed: float
-    orders: tuple[SpindleOrder, ...]
+    orders: tuple[SpectralLine, ...]
     on_circle: bool
 
 
@@ -267,7 +250,7 @@ def _evaluated(columns: Waves, count: int, solution: FloatArray) -> FloatArray:
 
 def _orders(
     basis: _Basis, solution: FloatArray, spread: FloatArray, mean: FloatArray
-) -> Iterator[SpindleOrder]:
+) -> Iterator[SpectralLine]:
     """Yield the orders that are separable from form; ``mean``: products of columns (p, p).
 
     Where the radius changes little, an order and a form of the same harmonic may both become large
@@ -279,7 +262,10 @@ def _orders(
         if ("order", k, k) in found:
             cosine, sine = found["order", k, k], found["order", k, -k]
             worse = float(max(spread[cosine], spread[sine]))
-            own = SpindleOrder(k, float(solution[cosine]), float(solution[sine]), worse)
+            own = SpectralLine(
+                coordinate=TURN, frequency=float(k), cosine=float(solution[cosine]),
+                sine=float(solution[sine]), amplitude_uncertainty=worse,
+            )  # fmt: skip
             alike = [i for i, (kind, _, m) in enumerate(basis.names) if abs(m) == k]
             part = solution[alike]
             together = float(part @ mean[np.ix_(alike, alike)] @ part)

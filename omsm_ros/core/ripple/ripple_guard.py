@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.ripple.accelerometer import LARGEST_GAIN, AccelerationLine, AccelerationLines
-from omsm_ros.core.ripple.coordinates import Coordinate
 from omsm_ros.core.ripple.density import aliased_frequency, significance
-from omsm_ros.core.ripple.form_removal import FormFit, FormRemoved, SpindleOrder
+from omsm_ros.core.ripple.form_removal import FormFit, FormRemoved
 from omsm_ros.core.ripple.lines import LEAST_SIGMA, LineSpectrum, find_lines, further_lines
 from omsm_ros.core.ripple.scan_signal import PATH, TIME, TURN, ScanSignal
 from omsm_ros.core.ripple.source_hypotheses import (
@@ -168,35 +167,26 @@ def _separated(
 def _order_lines(formless: FormRemoved, spectrum: LineSpectrum) -> Iterable[SpectralLine]:
     coordinates = spectrum.coordinates
     for found in formless.orders:
-        ratio = np.array(found.amplitude**2 / (2 * found.uncertainty**2))
+        ratio = np.array(found.amplitude**2 / (2 * found.amplitude_uncertainty**2))
         sigma = float(significance(ratio, len(formless.orders)))
         turn = coordinates[TURN]
-        if sigma < LEAST_SIGMA or _near_stronger_line(found, spectrum, turn):
+        if sigma < LEAST_SIGMA or any(
+            abs(line.possible.get(TURN, np.inf) - found.frequency) < _LEAKS_BINS * turn.resolution
+            and line.amplitude > found.amplitude
+            for line in spectrum.lines
+        ):
             continue
-        possible = {TURN: float(found.order)} | {
-            name: found.order * turn.pace / c.pace
+        possible = {TURN: found.frequency} | {
+            name: found.frequency * turn.pace / c.pace
             for name, c in coordinates.items()
             if c.like == turn.like and name != TURN
         }
-        yield SpectralLine(
-            coordinate=TURN,
-            frequency=float(found.order),
-            cosine=found.cosine,
-            sine=found.sine,
+        yield replace(
+            found,
             frequency_uncertainty=_OF_AN_ORDER * turn.resolution,
-            amplitude_uncertainty=found.uncertainty,
             significance=sigma,
             possible=possible,
         )
-
-
-def _near_stronger_line(order: SpindleOrder, spectrum: LineSpectrum, turn: Coordinate) -> bool:
-    return any(
-        abs(line.possible[TURN] - order.order) < _LEAKS_BINS * turn.resolution
-        and line.amplitude > order.amplitude
-        for line in spectrum.lines
-        if TURN in line.possible
-    )
 
 
 def name_lines(scans: Sequence[StudiedScan]) -> list[list[NamedLine]]:

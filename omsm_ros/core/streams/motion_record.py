@@ -130,14 +130,6 @@ def _runs(blocks: Iterable[Block], values: Values, stream: StreamInput) -> Itera
             yield SampleRun.of(block, arrival, reasons, np.asarray(value, np.float64))
 
 
-def _positions(names: Sequence[str]) -> Values:
-    def values(block: Any) -> tuple[FloatArray, BoolArray]:
-        every = np.array([block.z, *(getattr(block, name) for name in names)])
-        return every, np.all(np.isfinite(every), axis=0)
-
-    return values
-
-
 @dataclass(frozen=True, eq=False)
 class _Grid:
     """Axes (a, n) on the counts of one session from ``first`` on; NaN where not ``known`` (n,)."""
@@ -154,7 +146,12 @@ class _Grid:
     @classmethod
     def of(cls, axes: Sequence[AxisBlock], further: Sequence[str]) -> _Grid:
         stream = StreamInput()
-        runs = list(_runs(axes, _positions(further), stream))
+
+        def positions(block: AxisBlock) -> tuple[FloatArray, BoolArray]:
+            every = np.array([getattr(block, name) for name in ("z", *further)])
+            return every, np.all(np.isfinite(every), axis=0)
+
+        runs = list(_runs(axes, positions, stream))
         sessions = len({run.session for run in runs})
         first, samples = runs[0].first, runs[-1].end - runs[0].first
         if sessions > 1 or samples > MAX_RECORD_SAMPLES:
@@ -198,8 +195,8 @@ def _by_counter(
     distance: Sequence[DistanceBlock],
     reference: Sequence[DistanceBlock],
     period: float,
-    trigger: CommonTrigger = EQUAL_COUNTS,
-    further: Sequence[str] = (),
+    trigger: CommonTrigger,
+    further: Sequence[str],
 ) -> MotionRecord:
     grid = _Grid.of(axes, further)
     output, ok, account = grid.matched("distance", distance, trigger)
@@ -263,16 +260,12 @@ def _by_stamp(
     if reference:
         carried = axes_at_probe([_as_axis(block) for block in _ordered(reference)], grid)
         second = [replace(g, distance=c.z) for g, c in zip(grid, carried, strict=True)]
-    record = _covered(_by_counter(moved, grid, second, probe_period / finer, further=further))
-    received = sum(map(len, distance))
-    duplicates, unmatched = (record.counts[name] // finer for name in ("duplicates", "unmatched"))
-    paired = record.counts["paired"]
-    counts = dict(record.counts) | {
-        "received": received,
-        "duplicates": duplicates,
-        "unmatched": unmatched,
-        "not_ok": received - duplicates - unmatched - paired,
-    }
+    period = probe_period / finer
+    record = _covered(_by_counter(moved, grid, second, period, EQUAL_COUNTS, further))
+    counts = dict(record.counts) | {"received": sum(map(len, distance))}
+    counts |= {name: counts[name] // finer for name in ("duplicates", "unmatched")}
+    others = counts["duplicates"] + counts["unmatched"] + counts["paired"]
+    counts["not_ok"] = counts["received"] - others
     return replace(record, counts=counts, by_stamps=True)
 
 
@@ -349,7 +342,7 @@ class BlockBuffer(Generic[Probed]):
         before = self._blocks[-1] if self._blocks else None
         doubtful, self._doubtful = self._doubtful, None
         if doubtful is not None and block.first_sample == doubtful.end:
-            self._forget(len(self._blocks))
+            self.forget()
             self._append(doubtful)
             self._append(block)
             return

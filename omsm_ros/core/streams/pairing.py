@@ -72,13 +72,12 @@ class SampleRun:
 
     def part(self, start: int, stop: int) -> SampleRun:
         """Return the samples from index ``start`` up to ``stop``."""
-        return SampleRun(
-            self.session,
-            self.first + start,
-            self.stamp_ns + round(start * self.period_ns),
-            self.period_ns,
-            self.reasons[start:stop],
-            self.values[:, start:stop],
+        return replace(
+            self,
+            first=self.first + start,
+            stamp_ns=self.stamp_ns + round(start * self.period_ns),
+            reasons=self.reasons[start:stop],
+            values=self.values[:, start:stop],
         )
 
 

@@ -34,7 +34,6 @@ class StampClock:
 
     first, start_ns: a sample and its stamp [ns];  offset_ns: from its stamp to the line [ns]
     period_ns: [ns];  period_uncertainty_ns: standard uncertainty of it [ns]
-    jitter: standard deviation of the stamps about the line [s]
     """
 
     first: int
@@ -42,7 +41,6 @@ class StampClock:
     offset_ns: float
     period_ns: float
     period_uncertainty_ns: float = 0.0
-    jitter: float = 0.0
 
     @classmethod
     def through(cls, stamps: IntArray, nominal_ns: float) -> StampClock:
@@ -61,14 +59,7 @@ class StampClock:
         offset = float(late.mean() - drift * count.mean())
         residual = late - offset - drift * count
         variance = float(residual @ residual) / max(len(count) - 2, 1)
-        return cls(
-            first,
-            start,
-            offset,
-            nominal_ns + drift,
-            float(np.sqrt(variance / square)),
-            float(np.std(residual)) / NANOSECONDS_PER_S,
-        )
+        return cls(first, start, offset, nominal_ns + drift, float(np.sqrt(variance / square)))
 
     def since(self, count: FloatArray, origin_ns: int) -> FloatArray:
         """Return the times of samples ``count`` (n,) after ``origin_ns`` [s]."""
@@ -99,7 +90,7 @@ def fit_clock(blocks: Sequence[Block]) -> StampClock:
     # Few blocks with jitter do not show the rate, so the stated period stands.
     count, since = (stamps - stamps[0]).T.astype(np.float64)
     offset = float((since - count * nominal).mean())
-    return StampClock(clock.first, clock.start_ns, offset, nominal, jitter=clock.jitter)
+    return StampClock(clock.first, clock.start_ns, offset, nominal)
 
 
 def check_period(name: str, blocks: Sequence[Block], time_lapse: float = 1.0) -> None:

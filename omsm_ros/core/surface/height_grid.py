@@ -1,7 +1,8 @@
 """Height maps on an even grid, as points and as nominal surfaces; slopes of surfaces."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import TypeAlias
 
 import numpy as np
 
@@ -151,24 +152,12 @@ Gradient: TypeAlias = tuple[FloatArray, FloatArray]
 _STEP_M = 2 * MICROMETRE_M
 
 
-@runtime_checkable
-class SlopedSurface(Protocol):
-    """A surface with slopes in closed form."""
-
-    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the height [m] at x, y [m], of their broadcast shape."""
-        ...
-
-    def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Return the slopes ∂z/∂x, ∂z/∂y [1] at x, y [m]."""
-        ...
-
-
 def gradient_of(surface: Surface, x: FloatArray, y: FloatArray) -> Gradient:
     """Return the slopes of ``surface`` at x, y [m], by differences if it has no gradient."""
-    if isinstance(surface, SlopedSurface):
-        return surface.gradient(x, y)
-    return slopes_by_differences(surface, x, y, _STEP_M)
+    in_closed_form: Callable[..., Gradient] | None = getattr(surface, "gradient", None)
+    if in_closed_form is None:
+        return slopes_by_differences(surface, x, y, _STEP_M)
+    return in_closed_form(x, y)
 
 
 def unit_normal(slope_x: FloatArray, slope_y: FloatArray) -> FloatArray:

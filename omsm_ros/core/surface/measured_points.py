@@ -12,6 +12,8 @@ from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.errors import DataError, Notice
 from omsm_ros.quantities import COUNTER, POSITION, UNCERTAINTY
 
+_COLUMNS = {"x": POSITION, "y": POSITION, "height": POSITION,
+            "uncertainty": UNCERTAINTY, "sample": COUNTER}  # fmt: skip
 # Odd multiplier of the hash, 2⁶⁴ divided by the golden ratio (Knuth).
 _MIXED = np.uint64(0x9E3779B97F4A7C15)
 
@@ -38,35 +40,22 @@ class MeasuredPoints:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        columns = {"x": self.x, "y": self.y, "height": self.height}
-        optional = (("uncertainty", self.uncertainty), ("sample", self.sample))
-        shapes = {name: np.shape(column) for name, column in columns.items()}
-        shapes |= {name: np.shape(column) for name, column in optional if column is not None}
+        columns = {name: getattr(self, name) for name in _COLUMNS}
+        shapes = {name: np.shape(v) for name, v in columns.items() if v is not None}
         if len(set(shapes.values())) != 1 or self.x.ndim != 1:
             raise DataError("surface.columns", shapes=shapes)
         if not len(self.x):
             raise DataError("surface.empty_surface")
-        for name, column in columns.items():
-            POSITION.checked_all(column, DataError, name)
-        if self.uncertainty is not None:
-            UNCERTAINTY.checked_all(self.uncertainty, DataError, "uncertainty")
-        if self.sample is not None:
-            COUNTER.checked_all(self.sample, DataError, "sample")
+        for name in shapes:
+            _COLUMNS[name].checked_all(columns[name], DataError, name)
 
     def __len__(self) -> int:
         return len(self.x)
 
     def part(self, place: BoolArray | IntArray) -> MeasuredPoints:
         """Return the points at ``place``, a mask (n,) or indices."""
-        return MeasuredPoints(
-            x=self.x[place],
-            y=self.y[place],
-            height=self.height[place],
-            uncertainty=None if self.uncertainty is None else self.uncertainty[place],
-            sample=None if self.sample is None else self.sample[place],
-            missing=self.missing,
-            notes=self.notes,
-        )
+        columns = {name: getattr(self, name) for name in _COLUMNS}
+        return replace(self, **{n: v[place] for n, v in columns.items() if v is not None})
 
 
 def measured(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.ripple.form_removal import FormFit, SpindleOrder
+from omsm_ros.core.ripple.form_removal import FormFit
 from omsm_ros.core.ripple.scan_signal import ScanSignal
 
 NM = 1e-9
@@ -122,17 +122,20 @@ class TestOrders:
         _, angle = place(signal)
         wave = 5 * NM * np.cos(7 * angle) - 12 * NM * np.sin(7 * angle)
         found = without_form(replace(signal, height=signal.height + wave))
-        (order,) = [one for one in found.orders if one.order == 7]
-        assert order.cosine == pytest.approx(5 * NM, abs=4 * order.uncertainty)
-        assert order.sine == pytest.approx(-12 * NM, abs=4 * order.uncertainty)
-        assert order.amplitude == pytest.approx(13 * NM, abs=4 * order.uncertainty)
+        (order,) = [one for one in found.orders if one.frequency == 7]
+        assert order.cosine == pytest.approx(5 * NM, abs=4 * order.amplitude_uncertainty)
+        assert order.sine == pytest.approx(-12 * NM, abs=4 * order.amplitude_uncertainty)
+        assert order.amplitude == pytest.approx(13 * NM, abs=4 * order.amplitude_uncertainty)
 
     def test_its_uncertainty_is_its_scatter(self):
         found = []
         for seed in range(14):
             orders = without_form(scan(seed=seed)).orders
-            found.append(next(one for one in orders if one.order == 9))
-        pulls = [[one.cosine / one.uncertainty, one.sine / one.uncertainty] for one in found]
+            found.append(next(one for one in orders if one.frequency == 9))
+        pulls = [
+            [one.cosine / one.amplitude_uncertainty, one.sine / one.amplitude_uncertainty]
+            for one in found
+        ]
         assert np.sqrt(np.mean(np.square(pulls))) == pytest.approx(1.0, abs=0.25)
 
     def test_on_one_circle_figure_and_spindle_are_one_and_two_waves_are_form(self):
@@ -140,11 +143,13 @@ class TestOrders:
         _, angle = place(signal)
         found = without_form(replace(signal, height=signal.height + 9 * NM * np.cos(3 * angle)))
         assert found.on_circle
-        assert min(one.order for one in found.orders) == 3
-        (order,) = [one for one in found.orders if one.order == 3]
-        assert order.cosine == pytest.approx(9 * NM, abs=4 * order.uncertainty)
+        assert min(one.frequency for one in found.orders) == 3
+        (order,) = [one for one in found.orders if one.frequency == 3]
+        assert order.cosine == pytest.approx(9 * NM, abs=4 * order.amplitude_uncertainty)
         # For white noise on a circle the bound is that of a sum of cosines.
-        assert order.uncertainty == pytest.approx(1 * NM * np.sqrt(2 / COUNT), rel=0.1, abs=0)
+        assert order.amplitude_uncertainty == pytest.approx(
+            1 * NM * np.sqrt(2 / COUNT), rel=0.1, abs=0
+        )
 
     def test_an_order_that_only_cancels_form_on_a_narrow_ring_is_form(self):
         """With a bump on the part, order and form of two waves a turn are 140 nm with two signs."""
@@ -156,10 +161,7 @@ class TestOrders:
         assert max(one.amplitude for one in found.orders) < 40 * NM
 
     def test_orders_go_to_twelve(self):
-        assert {one.order for one in without_form(scan()).orders} <= set(range(2, 13))
-
-    def test_an_amplitude_is_that_of_both(self):
-        assert SpindleOrder(3, 3 * NM, -4 * NM, 0.0).amplitude == pytest.approx(5 * NM)
+        assert {one.frequency for one in without_form(scan()).orders} <= set(range(2, 13))
 
 
 class TestFormNextToLines:

@@ -35,12 +35,12 @@ def test_a_flat_part_needs_no_high_degree(made):
 
 def test_the_spindle_repeats_alike_at_every_radius_and_a_figure_does_not(made):
     signal = made("A", [("c", 3, 6e-9)], rpm=60, feed=6e-4, seconds=20.0)
-    order = next(o for o in without_form(signal).orders if o.order == 3)
-    assert order.amplitude == pytest.approx(6e-9, abs=4 * order.uncertainty + 0.1e-9)
+    order = next(o for o in without_form(signal).orders if o.frequency == 3)
+    assert order.amplitude == pytest.approx(6e-9, abs=4 * order.amplitude_uncertainty + 0.1e-9)
     figure = 40e-9 * (signal.radius / 12.7e-3) ** 3 * np.cos(6 * np.pi * signal.turn)
     order = next(
         o for o in without_form(replace(signal, height=signal.height + figure)).orders
-        if o.order == 3
+        if o.frequency == 3
     )  # fmt: skip
     assert order.amplitude == pytest.approx(6e-9, rel=0.15)
 

@@ -108,7 +108,6 @@ def test_an_exposure_averages_the_motion() -> None:
 def test_jitter_of_stamps_is_averaged_over_the_session() -> None:
     blocks = axis_blocks(jitter=0.2e-3, seconds=20.0)
     clock = fit_clock(blocks)
-    assert clock.jitter == pytest.approx(0.2e-3, rel=0.1)
     time = clock.since(np.array([0.0, 40_000.0]), 0)
     # 800 stamps know their line to jitter / sqrt(800), at the ends to twice that.
     assert np.allclose(time, [0.0, 10.0], rtol=0, atol=50e-6)

@@ -192,12 +192,10 @@ class TestClocks:
         assert clock.period_ns == pytest.approx(slope, rel=1e-9)
         found = clock.since(np.array([1_000_000.0, 1_002_000.0]), 5_000_000_000)
         np.testing.assert_allclose(found, (start + slope * np.array([0, 2000])) / 1e9, atol=1e-9)
-        left = stamps - start - slope * count
-        assert clock.jitter == pytest.approx(np.std(left) / 1e9, rel=1e-6)
 
     def test_one_block_is_as_even_as_it_says(self):
         clock = fit_clock(self.stamped(0.0, 1))
-        assert (clock.period_ns, clock.jitter) == (PERIOD * 1e9, 0.0)
+        assert clock.period_ns == PERIOD * 1e9
         assert clock.since(np.array([1_000_010.0]), 5_000_000_000) == pytest.approx(10e-3)
 
     def test_a_time_is_exact_however_long_ago_the_origin_is(self):
