@@ -117,13 +117,13 @@ class CorrectionState:
             report.add(WARN, "no calibration: nothing is published")
             return report
         report.values |= self.load.report(cpu, now)
-        report.values["stamp_skew_s"] = corrector.stamp_skew
-        slip = corrector.slips.state
+        report.values["stamp_skew_s"] = corrector.pairing.stamp_skew
+        slip = corrector.pairing.watch.state
         report.values |= {"slip_samples": slip.samples, "slip_seen_from_samples": slip.seen_from}
-        report.values["pairs_held"] = corrector.held
+        report.values["pairs_held"] = corrector.pairing.axes.held
         if slip.samples:
             report.add(ERROR, f"not corrected: {slip}")
-        if corrector.slips.in_doubt:
+        if corrector.pairing.watch.in_doubt:
             report.add(WARN, "the stamps do not show yet whether both devices count alike: waiting")
         if motion is not None:
             _add_motion(report, slip, motion)
@@ -391,7 +391,11 @@ class CorrectorNode(ManagedNode):
 
     def _settle(self) -> None:
         """Publish the samples that wait for stamps once the motion has ended."""
-        if self._corrector and self._corrector.held and self._state.has_paused(time.monotonic()):
+        if (
+            self._corrector
+            and self._corrector.pairing.axes.held
+            and self._state.has_paused(time.monotonic())
+        ):
             self._corrector.settle()
             self._publish(self._corrector.take())
 
@@ -414,7 +418,7 @@ class CorrectorNode(ManagedNode):
 
     def report(self) -> StateReport:
         """Return the account, and the present faults; publish account and verdict."""
-        if self._motion and self._corrector and not self._corrector.slips.same_stamps:
+        if self._motion and self._corrector and not self._corrector.pairing.watch.same_stamps:
             self._motion.judge()
         now, cpu = time.monotonic(), time.process_time()
         now_ns = self.get_clock().now().nanoseconds

@@ -356,7 +356,9 @@ class _RunningResults:
             found += self._axes.step_faults(resolution, self._lateral)
             samples = scan.account.distance.counted.get("slipped", 0)
             if samples:
-                found.append(f"{samples} samples were not corrected: {scan.corrector.slips.found}")
+                found.append(
+                    f"{samples} samples were not corrected: {scan.corrector.pairing.watch.found}"
+                )
             else:
                 found += skew_fault(skew, scan.sample_period, scan.options.trigger)
         rows, pitch, (low, high) = self.drawn.rows(), scan.options.pitch, self._z
@@ -402,7 +404,7 @@ class _RunningResults:
         return Correction(
             account=scan.account.as_dict(),
             budget=scan.corrector.budget,
-            stamp_skew=scan.corrector.stamp_skew,
+            stamp_skew=scan.corrector.pairing.stamp_skew,
             admission=scan.admitted,
             reasons=scan.reasons,
             statistics={name: one.statistics() for name, one in running},

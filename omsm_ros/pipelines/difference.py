@@ -1,6 +1,6 @@
 """Compare two measurements of one part, also of another instrument: task and files."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,7 @@ from omsm_ros.core.comparison.agreement import (
 from omsm_ros.core.comparison.compare import Comparison, SideSummary, compare_measurements_of_part
 from omsm_ros.core.comparison.matching import SEATED
 from omsm_ros.core.comparison.resampling import RADIUS_CELLS, TREND_DEGREE
-from omsm_ros.core.comparison.stated_errors import ComparedMeasurement
-from omsm_ros.core.correction.systematic import ScanFields
+from omsm_ros.core.comparison.stated_errors import ComparedMeasurement, ErrorFields
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.placement import Placed, PointBatch, placed
 from omsm_ros.core.registration.register import register
@@ -112,7 +111,7 @@ def _in_order(points: MeasuredPoints, drift: float | None) -> MeasuredPoints:
     return replace(points, notes=(*points.notes, note)) if drift is None else points
 
 
-def _fields_file_of(path: Path, points: MeasuredPoints) -> ScanFields | None:
+def _fields_file_of(path: Path, points: MeasuredPoints) -> ErrorFields | None:
     """Return the fields of the systematic errors at the points of a result folder, if stored."""
     folder = path if path.is_dir() else path.parent
     if path.is_file() and path.name != "cloud.ply":
@@ -120,7 +119,8 @@ def _fields_file_of(path: Path, points: MeasuredPoints) -> ScanFields | None:
     file = folder / SYSTEMATIC
     if not file.is_file() or points.missing:
         return None
-    return load_fields(file)
+    fields = load_fields(file)
+    return ErrorFields(fields.names, fields.at, fields.aligned)
 
 
 def compare_measurements(
@@ -207,15 +207,6 @@ def _terms(agreement: ComparisonAgreement | None) -> dict[str, Any] | None:
 POSE = "pose of the part"
 
 
-@dataclass(frozen=True, eq=False)
-class _FieldsAfterFit:
-    """Fields of errors after the fit of the pose; ``at`` computes them, as that of ScanFields."""
-
-    names: tuple[str, ...]
-    at: Callable[[int, int], FloatArray]
-    aligned: tuple[str, ...] = ()  # none of a pose: errors of two poses are independent
-
-
 def registered(
     m: ComparedMeasurement, nominal: Surface, dofs: Sequence[str]
 ) -> ComparedMeasurement:
@@ -262,6 +253,7 @@ def registered(
             points.part(kept), x=part.x, y=part.y, height=part.deviation,
             notes=(*points.notes, f"registered by {moved}", *left_out),
         ),
-        fields=fields and _FieldsAfterFit(names, of_scan, fields.aligned),
-        pose=_FieldsAfterFit((POSE,) * (len(found.pose_effects) + held), of_pose),
+        fields=fields and ErrorFields(names, of_scan, fields.aligned),
+        # Errors of two poses are independent, so none is aligned.
+        pose=ErrorFields((POSE,) * (len(found.pose_effects) + held), of_pose),
     )  # fmt: skip

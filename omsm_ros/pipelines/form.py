@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.core.comparison.stated_errors import ErrorFields
+from omsm_ros.core.correction.systematic import ScanFields
 from omsm_ros.core.form.analyse import FormResult, analyse_form
 from omsm_ros.core.form.deviation_map import UncertainValue, conformity
 from omsm_ros.core.form.drawing import Drawing
@@ -130,7 +131,7 @@ def open_measurement(
 
 
 def point_batches(
-    points: MeasuredPoints, fields: ErrorFields | None = None
+    points: MeasuredPoints, fields: ErrorFields | ScanFields | None = None
 ) -> Iterator[PointBatch]:
     """Yield the points in batches with the effects of the ``fields`` of systematic errors."""
     columns, starts = [getattr(points, n) for n in _PLACES], range(0, len(points), _PORTION)
@@ -138,7 +139,7 @@ def point_batches(
 
 
 def _batches(
-    parts: Iterable[Sequence[FloatArray]], fields: ErrorFields | None
+    parts: Iterable[Sequence[FloatArray]], fields: ErrorFields | ScanFields | None
 ) -> Iterator[PointBatch]:
     first = 0
     for part in parts:

@@ -32,7 +32,7 @@ from omsm_ros.io.bag_writer import atomic_bag
 from omsm_ros.io.tables.table import ForeignTable, TableForm, stated_unit
 from omsm_ros.pipelines.progress import state_progress
 from omsm_ros.quantities import shown
-from omsm_ros.units import DATE
+from omsm_ros.units import DATE, contradicts_unit
 
 _ARRAYS, _TDMS = (".npy", ".npz", ".mat", ".h5", ".hdf5"), ".tdms"
 _BAGS = (".mcap", ".bag", ".db3")
@@ -230,7 +230,7 @@ class _Source:
         for channel in self.channels:
             column = mapped.columns[channel]
             stated = stated_unit(table, column.name)
-            if column.contradicts(stated, channel):
+            if contradicts_unit(stated, column.unit, channel):
                 raise FileError(
                     f"{table} has {column.name!r} in {stated}, the map in {column.unit}; "
                     f"correct the map, or, if the file is wrong, write unit: count and count: what "

@@ -226,7 +226,7 @@ def _scan_facts(
         "turns": signal.turns,
         "spindle_speed_rpm": None if turn is None else turn.pace * minutes,
         "path_length": float(np.ptp(signal.path)),
-        "sampling": [asdict(place) for place in sampling_over(signal)],
+        "sampling": sampling_over(signal),
         "form": {
             "degree": studied.formless.degree,
             "rms_removed": studied.formless.removed,

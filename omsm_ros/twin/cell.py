@@ -94,10 +94,11 @@ class Scene:
 
     def positions(self, time: FloatArray) -> AxisPositions:
         """Return the true positions of the axes: the command, and the wobble of B."""
-        slides = self.motion.positions(time)
-        if not self.disturbances.machine.b_wobble_rad:
+        slides, machine = self.motion.positions(time), self.disturbances.machine
+        if not machine.b_wobble_rad:
             return slides
-        return slides._replace(b=slides.b + self.disturbances.machine.b_wobble(time))
+        wobble = machine.b_wobble_rad * np.sin(2 * np.pi * machine.b_wobble_hz * time)
+        return slides._replace(b=slides.b + wobble)
 
     def look(self, time: FloatArray, about: FloatArray | float = 0.0) -> ProbeTarget:
         """Return the situation at ``time`` (n,) [s]; ``about``: start for the distance [m]."""
@@ -197,14 +198,17 @@ def _shifting(disturbances: Disturbances, times: FloatArray, random: Random) -> 
     if not is_default(machine.drift):
         walk = Trajectory(times[0], times[1] - times[0], random_walk(times, random["drift"]))
         result.append(lambda time, slides: Shift(zero, zero, machine.drift.height(time, walk)))
-    if not is_default(machine.spindle):
+    if not is_default(spindle := machine.spindle):
+        noisy = spindle.axial_noise_m or spindle.radial_noise_m or spindle.tilt_noise_rad
         noise = [
             Trajectory(times[0], times[1] - times[0], random["spindle"].normal(size=len(times)))
-            for _ in range(5 if machine.spindle.is_noisy else 0)
+            for _ in range(5 if noisy else 0)
         ]
-        result.append(lambda time, slides: machine.spindle.shift(time, slides, noise))
-    if not (is_default(machine.x_slide_along_z) and is_default(machine.z_slide_along_x)):
-        result.append(lambda time, slides: machine.slides_shift(slides))
+        result.append(lambda time, slides: spindle.shift(time, slides, noise))
+    across, along = machine.z_slide_along_x, machine.x_slide_along_z
+    if not (is_default(across) and is_default(along)):
+        # A lateral motion of the probe is an opposite shift of the workpiece.
+        result.append(lambda _, at: Shift(-across.deviation(at.z), zero, along.deviation(at.x)))
     return result
 
 

@@ -99,11 +99,6 @@ class SpindleError(CheckedRecord):
     radial_noise_m: float = SIZE.of_field(0.0)
     tilt_noise_rad: float = ANGLE_NOISE.of_field(0.0)
 
-    @property
-    def is_noisy(self) -> bool:
-        """True if it has an asynchronous part."""
-        return bool(self.axial_noise_m or self.radial_noise_m or self.tilt_noise_rad)
-
     def shift(self, time: FloatArray, slides: AxisPositions, noise: list[Trajectory]) -> Shift:
         """Return the shift of the workpiece; ``noise``: five signals of variance one."""
         axial, radial, tilt = (
@@ -154,17 +149,6 @@ class MachineErrors(CheckedRecord):
     drift: Drift = field(default_factory=Drift)
     b_wobble_rad: float = ANGLE.of_field(0.0)
     b_wobble_hz: float = FREQUENCY.of_field(1.0)
-
-    def slides_shift(self, slides: AxisPositions) -> Shift:
-        """Return the shift of the workpiece by straightness errors of the slides."""
-        zero = np.zeros(1)
-        along = self.x_slide_along_z.deviation(slides.x)
-        # A lateral motion of the probe is an opposite shift of the workpiece.
-        return Shift(-self.z_slide_along_x.deviation(slides.z), zero, along)
-
-    def b_wobble(self, time: FloatArray) -> FloatArray:
-        """Return the oscillation of B [rad] at ``time`` [s], of its shape."""
-        return np.asarray(self.b_wobble_rad * np.sin(2 * np.pi * self.b_wobble_hz * time))
 
 
 def random_walk(times: FloatArray, random: np.random.Generator) -> FloatArray:

@@ -122,12 +122,10 @@ class FigureError(CheckedRecord):
         # The even cosine keeps the rings smooth at the centre.
         rings = self.ripple / 2 * np.cos(2 * np.pi * radius / self.ripple_pitch)
         error = np.asarray(waves.real + rings, np.float64)
-        return error + self.scallops(radius) if self.tool_marks else error
-
-    def scallops(self, radius: FloatArray) -> FloatArray:
-        """Return the height of tool marks [m] at ``radius`` [m]: a parabola from cusp to cusp."""
-        turn = radius / self.tool_feed
-        return np.asarray(self.tool_marks * 4 * (turn - np.rint(turn)) ** 2, np.float64)
+        if self.tool_marks:  # parabolas from cusp to cusp
+            turn = radius / self.tool_feed
+            error += self.tool_marks * 4 * (turn - np.rint(turn)) ** 2
+        return error
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import linalg, signal
 
 from omsm_ros.core.kinematics.trajectories import Motion
-from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import CheckedRecord
@@ -190,9 +190,5 @@ def _zero_order_hold_sections(system: TransferFunction, step: float) -> FloatArr
     zeros = linalg.eigvals(pencil, mass)
     zeros = zeros[np.isfinite(zeros) & (abs(zeros) < 1e6)]
     poles = np.exp(system.poles() * step)
-    gain = system.dc_gain * np.real(_at_one(poles) / _at_one(zeros))
+    gain = system.dc_gain * np.real(np.prod(1 - poles) / np.prod(1 - zeros))
     return np.asarray(signal.zpk2sos(zeros, poles, gain))
-
-
-def _at_one(roots: ComplexArray) -> complex:
-    return complex(np.prod(1 - roots))

@@ -87,7 +87,9 @@ class AccelerationSensor(CheckedRecord):
         self, acceleration: FloatArray, period: float, random: np.random.Generator
     ) -> AccelerationBlock:
         """Return the readings for an ``acceleration`` (n,) of the probe, every ``period`` [s]."""
-        z = self._high_passed(acceleration, period) * (1 + self.scale_ppm * PPM)
+        tau = 1 / (2 * np.pi * self.high_pass_hz)
+        b, a, _ = signal.cont2discrete(([tau, 0.0], [tau, 1.0]), period, method="bilinear")
+        z = signal.lfilter(b.ravel(), a, acceleration) * (1 + self.scale_ppm * PPM)
         noise = random.normal(0.0, self.noise_m_per_s2, (3, len(z)))
         return AccelerationBlock(
             stamp_ns=0,
@@ -97,11 +99,6 @@ class AccelerationSensor(CheckedRecord):
             y=self.cross_talk * z + noise[1],
             z=z + noise[2],
         )
-
-    def _high_passed(self, values: FloatArray, period: float) -> FloatArray:
-        tau = 1 / (2 * np.pi * self.high_pass_hz)
-        b, a, _ = signal.cont2discrete(([tau, 0.0], [tau, 1.0]), period, method="bilinear")
-        return np.asarray(signal.lfilter(b.ravel(), a, values))
 
 
 def acceleration_of(motion: Trajectory) -> Trajectory:

@@ -193,8 +193,11 @@ def _slow_parts(errors: StructureErrors, probe: Trajectory) -> FloatArray:
     """Return the effect of creep and soft modes on the motion of the probe (n,) [m]."""
     if not errors.lead_s:
         return np.zeros(1)
-    moving = _with_spin_up(probe)
-    added = np.zeros_like(moving)
+    # The motion about its mean, faded in smoothly before time 0.
+    before = max(round(-probe.start / probe.step), 1)
+    moving = probe.values - probe.values[:before].mean()
+    moving[:before] *= s_curve(np.arange(before) / before)
+    added: FloatArray = np.zeros_like(moving)
     for creep in errors.relaxations:
         filtered = _through(([1.0], [creep.time_constant_s, 1.0]), moving, probe.step)
         added += creep.fraction * (filtered - moving)
@@ -202,15 +205,6 @@ def _slow_parts(errors: StructureErrors, probe: Trajectory) -> FloatArray:
         ratio = ([mode.omega**2], [1.0, 2 * mode.damping_ratio * mode.omega, mode.omega**2])
         added += mode.participation * (_through(ratio, moving, probe.step) - moving)
     return added
-
-
-def _with_spin_up(probe: Trajectory) -> FloatArray:
-    """Return the motion about its mean, faded in smoothly before time 0."""
-    before = max(round(-probe.start / probe.step), 1)
-    mean = probe.values[:before].mean()
-    moving = probe.values - mean
-    moving[:before] *= s_curve(np.arange(before) / before)
-    return np.asarray(moving, np.float64)
 
 
 def _through(ratio: tuple[list[float], list[float]], values: FloatArray, step: float) -> FloatArray:

@@ -22,7 +22,7 @@ def reported(slip: int, late: float, tolerance: float = TWO_DRIVERS_S) -> tuple[
     for axes, distance in came:
         corrector.push_axes(axes)
         corrector.push_distance(distance)
-    assert not corrector.slips.same_stamps
+    assert not corrector.pairing.watch.same_stamps
     watch = watched(came, trigger.counter_offset)
     report = CorrectionState().report(corrector, 0.0, 0.0, watch)
     said = report.text if report.level == ERROR else ""

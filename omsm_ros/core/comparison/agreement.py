@@ -179,14 +179,13 @@ def judge(
 
 def _figures(matched: Matched, drawn: Sequence[FloatArray]) -> dict[str, ComparedFigure]:
     """Return the figures with their E_n by Monte Carlo (GUM Supplement 1)."""
-    plain = figures_of(matched)
     heights = matched.without_fit(np.stack([matched.a, matched.b]))
     found = {}
     for name, figure in FIGURES.items():
-        runs = [figure(own + errors) for own, errors in zip(heights, drawn, strict=True)]
+        own = float(figure(heights[0])), float(figure(heights[1]))
+        runs = [figure(height + errors) for height, errors in zip(heights, drawn, strict=True)]
         spread = float(np.std(runs[0] - runs[1]))
         # Noise increases a peak to valley; drawing it once more gives the bias to subtract.
-        own = (plain[name].a, plain[name].b)
         excess = [float(np.mean(run)) - value for run, value in zip(runs, own, strict=True)]
         expanded = _coverage_factor(len(FIGURES)) * spread
         e_n = ((own[0] - excess[0]) - (own[1] - excess[1])) / expanded if expanded > 0 else None

@@ -9,8 +9,8 @@ A systematic error is a sum of shapes over the surface, each with an independent
 standard deviation one (Karhunen-Loève expansion): a shape is its effect on every height [m].
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -122,22 +122,17 @@ AT_ONCE, STATED, ESTIMATED, NOT_KNOWN = (
 )  # fmt: skip
 
 
-class ErrorFields(Protocol):
-    """Effects of systematic errors on points, as ``ScanFields`` provides them."""
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorFields:
+    """Effects of systematic errors on points.
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Name of the source of each field."""
-        ...
+    names: source of each;  at: returns them (s, count) [m] at ``count`` points from a first one on
+    aligned: names of sources with the same error in every scan of one calibration
+    """
 
-    @property
-    def aligned(self) -> tuple[str, ...]:
-        """Names of sources with the same error in every scan of one calibration."""
-        ...
-
-    def at(self, first: int, count: int) -> FloatArray:
-        """Return the fields (s, count) [m] at the points from ``first`` on."""
-        ...
+    names: tuple[str, ...]
+    at: Callable[[int, int], FloatArray]
+    aligned: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

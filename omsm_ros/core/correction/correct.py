@@ -20,14 +20,7 @@ from omsm_ros.core.correction.machine_sources import (
     POINT_SOURCES,
     whole_scan_sources,
 )
-from omsm_ros.core.correction.motion_filter import (
-    MOVED,
-    RATE,
-    Blend,
-    MotionFilter,
-    MotionFilters,
-    undetected_rows,
-)
+from omsm_ros.core.correction.motion_filter import MOVED, RATE, Blend, MotionFilter, MotionFilters
 from omsm_ros.core.correction.source_kinds import SystematicSource
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.systematic import MOST_TRACED, ScanPoints, ScanTrace
@@ -43,10 +36,9 @@ from omsm_ros.core.streams.blocks import (
     RejectionReason,
     joined,
 )
-from omsm_ros.core.streams.continuity import Arrival
 from omsm_ros.core.streams.pairing import Pairing, SampleRun, StreamInput
 from omsm_ros.core.streams.statistics import RunningScatter
-from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger, TriggerSlipDetector
+from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.quantities import GAIN, LAG, WAIT, CheckedRecord
 from omsm_ros.units import NANOSECONDS_PER_S
@@ -98,6 +90,7 @@ class Corrector:
     most_waiting: number of samples that may wait, for files; None takes ``max_pending``
     most_traced: largest number of points in ``trace``
     trace: evenly spaced points for the systematic errors of the whole scan
+    pairing: of the two streams, with its verdicts on slips and the pairs that are held for one
     """
 
     def __init__(
@@ -114,7 +107,7 @@ class Corrector:
         self._sources = options.sources or ErrorSources.of(calibration)
         self._period: float | None = None
         self._axes, self._distance = StreamInput(), StreamInput(options.trigger.counter_offset)
-        self._pairing = Pairing(self._axes, self._distance, options.trigger)
+        self.pairing = Pairing(self._axes, self._distance, options.trigger)
         self._motion: MotionFilter | None = None
         names = (*OF_CALIBRATION, *POINT_SOURCES, SCAN_SCATTER)
         self._variance = defaultdict(float, dict.fromkeys(names, 0.0))
@@ -138,9 +131,9 @@ class Corrector:
             values = np.array([block.x, block.y, block.z, block.b, block.c], np.float64)
             whole = SampleRun.of(block, arrival, np.zeros(len(block), np.uint8), values)
             for run in motion.push(whole):
-                self._pairing.axes.push(run)
+                self.pairing.axes.push(run)
             self._join()
-            self._pairing.axes.limit(self._most_pending(block))
+            self.pairing.axes.limit(self._most_pending(block))
 
     def push_distance(self, *blocks: DistanceBlock) -> None:
         """Queue the readings of one block or of several consecutive ones.
@@ -150,9 +143,14 @@ class Corrector:
         block = joined(blocks)
         self._filter_for(block)
         if (arrival := self._distance.new(block, blocks)) is not None:
-            self._pairing.distance.push(_distance_run(block, arrival))
+            intensity = block.intensity if len(block.intensity) else np.full(len(block), np.nan)
+            reasons = np.where(block.ok, RejectionReason.NONE, RejectionReason.INVALID)
+            values = np.array([block.distance, intensity], np.float64)
+            self.pairing.distance.push(
+                SampleRun.of(block, arrival, reasons.astype(np.uint8), values)
+            )
             self._join()
-            self._pairing.distance.limit(self._most_pending(block))
+            self.pairing.distance.limit(self._most_pending(block))
 
     def _most_pending(self, newest: AxisBlock | DistanceBlock) -> int:
         live = int(self._options.max_pending / newest.sample_period)
@@ -168,16 +166,16 @@ class Corrector:
 
     def settle(self) -> None:
         """Correct the pairs that wait for further stamps, because both streams have paused."""
-        self._correct(self._pairing.end())
+        self._correct(self.pairing.end())
 
     def finish(self) -> SurfacePoints | None:
         """End both streams and return the remaining points; later blocks begin a new session."""
         if self._motion is not None:
             for run in self._motion.end():
-                self._pairing.axes.push(run)
+                self.pairing.axes.push(run)
         self._join()
-        self._correct(self._pairing.end())
-        for queue in (self._pairing.axes, self._pairing.distance):
+        self._correct(self.pairing.end())
+        for queue in (self.pairing.axes, self.pairing.distance):
             queue.clear()
         for stream in (self._axes, self._distance):
             stream.end()
@@ -187,29 +185,11 @@ class Corrector:
     def account(self) -> Account:
         """Account of every sample received so far."""
         warming = self._motion.pending if self._motion else 0
-        axes, distance = self._pairing.axes, self._pairing.distance
+        axes, distance = self.pairing.axes, self.pairing.distance
         return Account(
             axes=self._axes.tally.snapshot(axes.pending + axes.held + warming),
             distance=self._distance.tally.snapshot(distance.pending + distance.held),
         )
-
-    @property
-    def stamp_skew(self) -> float | None:
-        """Time of the axes minus time of the distance for the newest common trigger [s].
-
-        If it is large or drifts, the devices count different triggers.
-        """
-        return self._pairing.stamp_skew
-
-    @property
-    def held(self) -> int:
-        """Number of pairs that wait for a verdict on their counters."""
-        return self._pairing.axes.held
-
-    @property
-    def slips(self) -> TriggerSlipDetector:
-        """Verdicts on slips between the two counters."""
-        return self._pairing.watch
 
     @property
     def budget(self) -> dict[str, float]:
@@ -239,12 +219,14 @@ class Corrector:
         self._random = reading_variances(self._sources, noise_gain, self._static_gain)
         self._scatter = RunningScatter(float(np.sqrt(sum(self._random.values()))))
         self._random["discretisation"] = self._sources.discretisation**2
-        self.trace.undetected = undetected_rows(filters)
+        rows = [np.arange(len(f.dynamics)) >= len(f.dynamics) - f.undetected for f in filters]
+        # The differences between members of a set come last and are not model errors.
+        self.trace.undetected = np.concatenate([*rows, np.zeros(len(filters) - 1, np.bool_)])
         blend = Blend(known) if isinstance(known, CalibrationSet) else None
         return MotionFilter(*filters, blend=blend)
 
     def _join(self) -> None:
-        self._correct(self._pairing.pairs())
+        self._correct(self.pairing.pairs())
 
     def _correct(self, pairs: Iterable[tuple[SampleRun, SampleRun]]) -> None:
         for axes, distance in pairs:
@@ -296,9 +278,3 @@ def latency_in_use(calibration: Calibration, options: CorrectionOptions) -> floa
     """Return the delay of X, Y, B and C [s]: the stated one, else the calibration's latency."""
     stated = options.probe_latency
     return calibration.latency.delay_s if stated is None else stated
-
-
-def _distance_run(block: DistanceBlock, arrival: Arrival) -> SampleRun:
-    intensity = block.intensity if len(block.intensity) else np.full(len(block), np.nan)
-    reasons = np.where(block.ok, RejectionReason.NONE, RejectionReason.INVALID).astype(np.uint8)
-    return SampleRun.of(block, arrival, reasons, np.array([block.distance, intensity], np.float64))

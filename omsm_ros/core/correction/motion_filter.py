@@ -105,13 +105,6 @@ class MotionFilters:
         return max([settled, *([self.lateral.settling_samples(SETTLED)] if self.lateral else [])])
 
 
-def undetected_rows(filters: Sequence[MotionFilters]) -> BoolArray:
-    """Return True for the sensitivities of undetected model error of a MotionFilter, (r,)."""
-    rows = [np.arange(len(f.dynamics)) >= len(f.dynamics) - f.undetected for f in filters]
-    # The differences between members of a set come last and are not model errors.
-    return np.concatenate([*rows, np.zeros(len(filters) - 1, np.bool_)])
-
-
 def forgetting_samples(dynamics: TransferFunction, sample_period: float) -> int:
     """Return the samples after which a wrong initial state of G has decayed to ``SETTLED``.
 

@@ -240,19 +240,16 @@ class ScanTrace:
             dynamics=motion[2:],
             undetected=self.undetected,
         )
-        self._keep(points)
+        self.seen += len(points)
+        chosen = self._kept.chosen(len(points))
+        rows = [getattr(points, name)[chosen] for name in _COLUMNS]
+        self._kept.add_chosen(np.stack([*rows, *points.dynamics[:, chosen]]).T, len(points))
         return points
 
     @property
     def every(self) -> int:
         """Step from one kept point to the next."""
         return self._kept.every
-
-    def _keep(self, points: ScanPoints) -> None:
-        self.seen += len(points)
-        chosen = self._kept.chosen(len(points))
-        rows = [getattr(points, name)[chosen] for name in _COLUMNS]
-        self._kept.add_chosen(np.stack([*rows, *points.dynamics[:, chosen]]).T, len(points))
 
     def points(self) -> ScanPoints:
         """Return the kept points in the order of time."""

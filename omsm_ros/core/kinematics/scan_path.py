@@ -64,17 +64,14 @@ class ScanPathReader:
             self._passed += len(block)
             if self._kept < self._most:
                 for part in known_parts(block, np.isfinite(block.z)):
-                    self._keep(part)
+                    if not self._runs or _break(self._runs[-1][-1], part):
+                        self._runs.append([])
+                    self._runs[-1].append(part)
+                    self._kept += len(part)
         elif isinstance(block, DistanceBlock) and self._readings_kept < self._most:
             readings = np.where(block.ok, block.distance, np.nan)
             self._readings.append((block.first_sample, readings))
             self._readings_kept += len(block)
-
-    def _keep(self, block: AxisBlock) -> None:
-        if not self._runs or _break(self._runs[-1][-1], block):
-            self._runs.append([])
-        self._runs[-1].append(block)
-        self._kept += len(block)
 
     def path(self) -> ScanPath | None:
         """Return the path collected so far; None without any Z."""

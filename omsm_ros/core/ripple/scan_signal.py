@@ -174,21 +174,12 @@ def _longest_run(count: IntArray, *columns: FloatArray) -> tuple[IntArray, ...]:
     return tuple(np.asarray(values[part]) for values in (count, *columns))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sampling:
-    """Sampling of the part at one radius.
+def sampling_over(signal: ScanSignal, places: int = 5) -> list[dict[str, float]]:
+    """Return the sampling at ``places`` radii, outermost first; at one radius on a circle.
 
     radius: [m];  distance: between samples along the path [m] (Table 1 of the paper)
     shortest_wavelength: without aliasing, twice the distance [m]
     """
-
-    radius: float
-    distance: float
-    shortest_wavelength: float
-
-
-def sampling_over(signal: ScanSignal, places: int = 5) -> list[Sampling]:
-    """Return the sampling at ``places`` radii, outermost first; at one radius on a circle."""
     samples = np.diff(signal.sample)
     distance = abs(np.diff(signal.path)) / samples
     middle = 0.5 * (signal.radius[1:] + signal.radius[:-1])
@@ -199,4 +190,4 @@ def sampling_over(signal: ScanSignal, places: int = 5) -> list[Sampling]:
         for outer, inner in pairwise(np.linspace(high, low, count + 1))
     ]
     usual = [np.median([middle[r], distance[r]], axis=1).tolist() for r in rings if r.any()]
-    return [Sampling(radius=at, distance=step, shortest_wavelength=2 * step) for at, step in usual]
+    return [{"radius": at, "distance": d, "shortest_wavelength": 2 * d} for at, d in usual]

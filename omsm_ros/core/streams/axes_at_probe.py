@@ -59,7 +59,12 @@ def axes_at_probe(
     """
     if not (np.isfinite(delay) and 0 <= exposure < np.inf):
         raise ConfigurationError("streams.exposure", delay=delay, exposure=exposure)
-    tracks = [_Track.of(run, clock) for run, clock in _runs(axes)]
+    tracks = [
+        _Track.of(run, clock)
+        for session in _sessions(axes)
+        for clock in [fit_clock(session)]
+        for run in uninterrupted(session)
+    ]
     if not any(track.spline for track in tracks):
         raise DataError("streams.no_axis_run", least=_SPLINE_DEGREE + 1)
     nodes = delay + (0.5 * exposure * _EXPOSURE_NODES if exposure else np.zeros(1))
@@ -131,12 +136,3 @@ def _sessions(blocks: Iterable[B]) -> list[list[B]]:
         if again < len(block.stamps):
             placed.append((arrival.session, without_first_message(block, again)))
     return [[b for _, b in group] for _, group in groupby(placed, key=lambda item: item[0])]
-
-
-def _runs(blocks: Iterable[AxisBlock]) -> list[tuple[list[AxisBlock], StampClock]]:
-    """Return uninterrupted runs of blocks, each with the clock of its session."""
-    runs: list[tuple[list[AxisBlock], StampClock]] = []
-    for session in _sessions(blocks):
-        clock = fit_clock(session)
-        runs += [(run, clock) for run in uninterrupted(session)]
-    return runs

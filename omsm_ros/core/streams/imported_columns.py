@@ -13,7 +13,7 @@ import numpy as np
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray, IntArray, Status
 from omsm_ros.errors import DataError
 from omsm_ros.quantities import COUNTER, INTENSITY_READING, SAMPLE_PERIOD, STAMP, TIME
-from omsm_ros.units import DATE, NANOSECONDS_PER_S, SINCE_1970, contradicts_unit
+from omsm_ros.units import DATE, NANOSECONDS_PER_S, SINCE_1970
 
 AXES = ("x", "y", "z", "b", "c")
 PROBE = ("distance", "intensity")
@@ -49,10 +49,6 @@ class Column:
     factor: float = 1.0
     constant: float = 0.0
     unit: str = ""
-
-    def contradicts(self, stated: str, channel: str) -> bool:
-        """Return whether ``stated``, the unit in the file, is another one."""
-        return contradicts_unit(stated, self.unit, channel)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,8 +182,9 @@ def counter_of_times(
 
 def counter_of_triggers(values: FloatArray, before: int) -> IntArray:
     """Return the trigger count (n,) of each row; raise DataError unless whole and rising."""
-    if not np.all(np.isfinite(values)) or np.any(values != np.round(values)):
-        bad = int(np.argmax(~np.isfinite(values) | (values != np.round(values))))
+    whole = np.isfinite(values) & (values == np.round(values))
+    if not np.all(whole):
+        bad = int(np.argmin(whole))
         last = before if bad == 0 else values[bad - 1]
         raise DataError("streams.trigger", value=float(values[bad]), before=float(last))
     COUNTER.checked_all(values, DataError, "trigger")

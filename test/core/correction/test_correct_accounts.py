@@ -141,10 +141,10 @@ def test_what_waits_in_vain_is_bounded(scan: Recording) -> None:
 
 def test_stamps_that_disagree_about_a_trigger_are_reported(scan: Recording) -> None:
     corrector = Corrector(CALIBRATION)
-    assert corrector.stamp_skew is None
+    assert corrector.pairing.stamp_skew is None
     corrector.push_axes(scan.axes)
     corrector.push_distance(shifted(scan.distance, 0, 0.04))  # type: ignore[arg-type]
-    assert corrector.stamp_skew == pytest.approx(-0.04)
+    assert corrector.pairing.stamp_skew == pytest.approx(-0.04)
 
 
 def test_a_refused_block_leaves_the_account_as_it_was(scan: Recording) -> None:

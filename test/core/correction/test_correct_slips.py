@@ -69,7 +69,7 @@ def test_what_slipped_is_counted_and_gives_no_points(
     assert slipped == 5000 - MISSED - 1 - points.sample[-1]
     assert balanced(account.axes)
     assert balanced(account.distance)
-    assert corrector.slips.state.samples == -MISSED
+    assert corrector.pairing.watch.state.samples == -MISSED
 
 
 @pytest.mark.parametrize("together", [1, 7, 30, 200])
@@ -114,7 +114,7 @@ def test_blocks_that_a_bag_joins_are_judged_by_the_stamps_of_all(
     assert account == expected
     assert same_points(replace(found, stamp_ns=0), replace(each, stamp_ns=0))
     assert ("slipped" in account.distance.counted) is (drivers != "one")
-    assert corrector.slips.same_stamps is (drivers == "one")
+    assert corrector.pairing.watch.same_stamps is (drivers == "one")
 
 
 def test_diagnostics_say_what_slipped_and_what_to_do(
@@ -144,7 +144,7 @@ def test_a_counter_that_begins_anew_alone_is_reported_with_the_remedy(
     assert "'counter_offset' 2000" in report.text
     stated = CorrectionOptions(trigger=CommonTrigger(counter_offset=2000))
     _, account, corrector = corrected(axes, restarted, 4, stated)
-    assert corrector.slips.state.samples == 0
+    assert corrector.pairing.watch.state.samples == 0
     assert account.axes.corrected > 6900
 
 

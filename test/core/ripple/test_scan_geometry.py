@@ -87,8 +87,8 @@ class TestSampling:
     def test_a_gap_of_the_trigger_is_no_wider_sampling(self):
         sample = np.r_[np.arange(500), np.arange(3000, 3500)]
         (only,) = sampling_over(self.signal(sample, 3e-6 * sample, np.full(1000, 5e-3)))
-        assert (only.radius, only.distance) == (pytest.approx(5e-3), pytest.approx(3e-6))
-        assert only.shortest_wavelength == pytest.approx(6e-6)
+        assert (only["radius"], only["distance"]) == (pytest.approx(5e-3), pytest.approx(3e-6))
+        assert only["shortest_wavelength"] == pytest.approx(6e-6)
 
     @pytest.mark.parametrize("places", [1, 3, 8])
     def test_rings_go_from_the_outermost_to_the_innermost(self, places):
@@ -97,8 +97,8 @@ class TestSampling:
         assert len(found) == places
         width = 8e-3 / places
         expected = 10e-3 - width * (0.5 + np.arange(places))
-        assert [one.radius for one in found] == pytest.approx(list(expected), rel=1e-2)
-        assert [one.distance for one in found] == pytest.approx(list(expected), rel=1e-2)
+        assert [one["radius"] for one in found] == pytest.approx(list(expected), rel=1e-2)
+        assert [one["distance"] for one in found] == pytest.approx(list(expected), rel=1e-2)
 
     def test_its_times_are_those_of_the_trigger(self):
         sample = np.array([0, 1, 2, 5, 9])

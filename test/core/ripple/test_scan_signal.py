@@ -13,15 +13,15 @@ from omsm_ros.errors import DataError
 def test_sampling_distance_of_the_papers_table(made, rpm, micrometres):
     """Table 1 (F2's digits in order), on a circle of 21.6 mm."""
     (place,) = sampling_over(made("F", [], rpm=rpm, feed=0.0, radius=21.6e-3, seconds=4.0))
-    assert place.distance * 1e6 == pytest.approx(micrometres, rel=0.01)
-    assert place.shortest_wavelength == pytest.approx(2 * place.distance)
+    assert place["distance"] * 1e6 == pytest.approx(micrometres, rel=0.01)
+    assert place["shortest_wavelength"] == pytest.approx(2 * place["distance"])
 
 
 def test_a_spiral_is_sampled_finer_further_in(made):
     places = sampling_over(made("A", [], rpm=60.0, feed=5e-4, seconds=20.0))
-    assert [p.radius for p in places] == sorted((p.radius for p in places), reverse=True)
+    assert [p["radius"] for p in places] == sorted((p["radius"] for p in places), reverse=True)
     for place in places:
-        assert place.distance == pytest.approx(2 * np.pi * place.radius / 1000, rel=1e-3)
+        assert place["distance"] == pytest.approx(2 * np.pi * place["radius"] / 1000, rel=1e-3)
 
 
 @pytest.mark.parametrize("noise", [0.0, 20e-9])
