@@ -190,5 +190,5 @@ def _zero_order_hold_sections(system: TransferFunction, step: float) -> FloatArr
     zeros = linalg.eigvals(pencil, mass)
     zeros = zeros[np.isfinite(zeros) & (abs(zeros) < 1e6)]
     poles = np.exp(system.poles() * step)
-    gain = system.dc_gain * np.real(np.prod(1 - poles) / np.prod(1 - zeros))
+    gain = system.dc_gain * np.real(complex(np.prod(1 - poles)) / complex(np.prod(1 - zeros)))
     return np.asarray(signal.zpk2sos(zeros, poles, gain))
