@@ -26,21 +26,17 @@ class TracedTransport:
     def __init__(
         self, transport: Transport, path: Path, monotonic: Callable[[], float] = time.monotonic
     ) -> None:
-        self._transport = transport
+        self._transport, self.name = transport, transport.name
         self._path = path
         self._monotonic = monotonic
         self._file: TextIO | None = None
         self._begun, self._began = False, 0.0
 
-    @property
-    def name(self) -> str:
-        """Return the name of the transport that is traced."""
-        return self._transport.name
-
-    @property
-    def baud_rate(self) -> int | None:
-        """Return the baud rate of the transport that is traced; None if it has none."""
-        return getattr(self._transport, "baud_rate", None)
+    def __getattr__(self, name: str) -> Any:
+        """Return what only some transports have, such as a baud rate."""
+        if name.startswith("_"):  # of an incomplete copy
+            raise AttributeError(name)
+        return getattr(self._transport, name)
 
     def spare(self) -> Any:
         """Return another connection of the transport that is traced, in the same trace."""

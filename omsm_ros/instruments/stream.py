@@ -113,7 +113,8 @@ class StreamDevice:
         except DeviceError:
             self._cutter.lost_settings = self.decoded > 0  # it may have been switched off
             raise
-        arrival_ns, now = self._now_ns(), self._monotonic()
+        age = getattr(self._transport, "age", 0.0)  # known of TCP
+        arrival_ns, now = self._now_ns() - round(age * NANOSECONDS_PER_S), self._monotonic() - age
         if data or not self._came_ns:
             self._came_ns, self._came_at = arrival_ns, now
         samples = self._decode(data)

@@ -8,10 +8,12 @@ from __future__ import annotations
 import math
 import re
 import socket
+import struct
 import sys
 import termios
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
 from typing import Any, Protocol
 from urllib.parse import SplitResult, urlsplit
@@ -20,6 +22,7 @@ import serial
 from serial.tools import list_ports
 
 from omsm_ros.errors import ConfigurationError, DeviceError, DeviceTimeoutError
+from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S
 
 
 def parts_of(address: str) -> SplitResult:
@@ -46,6 +49,12 @@ _KEEP_ALIVE = {
     socket.TCP_KEEPCNT: 10,
     socket.TCP_USER_TIMEOUT: 10_000,
 }
+# Linux notes when the last segment read arrived, by the clock of the date: socket(7).
+_STAMPED = (socket.SOL_SOCKET, 35)  # SO_TIMESTAMPNS, which Python does not name
+_TIMESPEC = struct.Struct("@ll")
+# The clock of the date was set, or this process was interrupted between two looks at the clocks, if
+# they differ by so much more than before [ns].
+_SET_NS = 20_000
 # Time to connect once more, while the silent connection is not read [s].
 _SPARE_S = 0.5
 _SERIAL_SCHEME = "serial://"
@@ -179,7 +188,11 @@ class SerialTransport:
 
 
 class TcpTransport:
-    """A TCP client connection."""
+    """A TCP client connection.
+
+    age: how long before the end of the last read its last byte arrived, by the kernel [s]; 0 if the
+        kernel does not say it, or the clock was set meanwhile
+    """
 
     def __init__(self, host: str, port: int, connect_timeout: float = 5.0) -> None:
         if not 0 < port < 2**16:
@@ -188,6 +201,8 @@ class TcpTransport:
         self._address = (host, port)
         self._connect_timeout = connect_timeout
         self._socket: socket.socket | None = None
+        self.age = 0.0
+        self._offset = self._steady_since = 0  # date less monotonic clock, and since when [ns]
 
     def spare(self) -> TcpTransport:
         """Return another connection to the same address, not yet open."""
@@ -208,20 +223,31 @@ class TcpTransport:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in _KEEP_ALIVE.items():
             connection.setsockopt(socket.IPPROTO_TCP, option, value)
+        with suppress(OSError):  # refused by other systems than Linux
+            connection.setsockopt(*_STAMPED, 1)
         self._socket = connection
 
     def read(self, timeout: float) -> bytes:
         connection = self._connected()
         try:
             connection.settimeout(timeout)
-            data = connection.recv(_CHUNK_BYTES)
+            data, notes, *_ = connection.recvmsg(_CHUNK_BYTES, socket.CMSG_SPACE(_TIMESPEC.size))
         except (TimeoutError, BlockingIOError):
-            return b""
+            data, notes = None, []
         except OSError as err:
             raise self._lost(str(err)) from err
-        if not data:
+        date, now = time.time_ns(), time.monotonic_ns()
+        if abs(date - now - self._offset) > _SET_NS:
+            self._offset, self._steady_since = date - now, now
+        self.age = 0.0
+        for level, kind, stamp in notes:
+            if (level, kind) == _STAMPED:
+                seconds, nanoseconds = _TIMESPEC.unpack(stamp)
+                age = date - seconds * NANOSECONDS_PER_S - nanoseconds
+                self.age = age * NANOSECOND_S if 0 < age < now - self._steady_since else 0.0
+        if data == b"":
             raise self._lost("closed by the device")
-        return data
+        return data or b""
 
     def write(self, data: bytes) -> None:
         connection = self._connected()

@@ -17,7 +17,7 @@ NEVER, AT_ONCE = 1e6, 1e-12  # pauses [s]
 class Script:
     """A transport that plays portions; what it has not is silence, an exception is raised."""
 
-    name = "script"
+    name, age = "script", 0.0
 
     def __init__(self, *portions: bytes | Exception) -> None:
         self.portions = list(portions)

@@ -40,6 +40,16 @@ def test_unknown_verdicts_are_counted_and_lost() -> None:
 # Time.
 
 
+def test_samples_are_stamped_by_their_arrival_not_by_the_read() -> None:
+    """The transport knows by the kernel how long the bytes waited for a busy host."""
+    script = Script(encode_frames(frames_of(np.arange(10))))
+    script.age = 0.25
+    device = GenericStreamDevice(script, StreamSettings(block_size=10), lambda: 10**18)
+    device.open()
+    ((axes, _),) = device.poll(0.0)
+    assert axes.stamp_ns == 10**18 - 250 * MS - 9 * MS
+
+
 @pytest.mark.parametrize("time_ns", [0, 10**18])
 @pytest.mark.parametrize("together", [1, 20])
 def test_a_time_that_stands_still_is_an_error(time_ns: int, together: int) -> None:

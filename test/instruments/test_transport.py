@@ -6,6 +6,7 @@ import contextlib
 import os
 import socket
 import threading
+import time
 import tty
 from collections.abc import Iterator
 from io import FileIO
@@ -268,3 +269,32 @@ def test_a_device_that_became_slower_is_awaited_longer_at_each_attempt(
     with patience:
         patience.note(0.01)
     assert patience.seconds == pytest.approx(0.52)
+
+
+def test_tcp_tells_how_long_its_bytes_have_waited(
+    server: socket.socket, tcp_transport: TcpTransport, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A busy host reads late; the kernel notes when the bytes came. Nothing is said of bytes that
+    came before the clock was set."""
+    tcp_transport.open()
+    seen = 0
+    connection, _ = server.accept()
+    with connection:
+        for step in (0, 0, 0, 10**9, -(10**9)):
+            assert tcp_transport.read(0.01) == b""
+            assert tcp_transport.age == 0
+            before = time.monotonic()
+            connection.sendall(b"12 34\n")
+            sent = time.monotonic()
+            time.sleep(0.1)
+            clock = time.time_ns
+            monkeypatch.setattr(time, "time_ns", lambda clock=clock, step=step: clock() + step)
+            began = time.monotonic()
+            assert tcp_transport.read(SOON) == b"12 34\n"
+            ended = time.monotonic()
+            if step:
+                assert tcp_transport.age == 0
+            elif tcp_transport.age:  # else it was interrupted between its looks at the clocks
+                assert began - sent - 1e-4 <= tcp_transport.age <= ended - before + 1e-4
+                seen += 1
+    assert seen
