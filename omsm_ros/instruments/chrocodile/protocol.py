@@ -198,12 +198,12 @@ class _Counter:
             self._offset = layout.offsets[index]
             self._modulus = 2 ** (8 * self._kind.itemsize)
             self.needs = self._offset + self._kind.itemsize
-        self._last: int | None = None
-        self._step = 1
+        self.forget()
 
     def forget(self) -> None:
         """Begin with the next telegram."""
-        self._last, self._step = None, 1
+        self._last: int | None = None
+        self._step = 1
 
     def steps(self, raw: NDArray[np.uint8], starts: NDArray[np.intp]) -> NDArray[np.intp]:
         """Return the steps from telegrams in ``raw`` at ``starts`` (n,) to the next ones."""
@@ -262,12 +262,14 @@ class LineDecoder:
         good = [line for line in short if self._line.fullmatch(line) is not None]
         shape = len(good), len(self._layout.signals)
         values = np.fromstring(b" ".join(good), sep=" ").reshape(shape)
-        fits = self._fitting(values)
+        lowest, highest, whole = self._limits
+        inside = (values >= lowest) & (values <= highest)
+        fits = (inside & (~whole | (values == np.rint(values)))).all(axis=1)
         values = values[fits]
         if lines:
             # The bytes before the first end of a line may be a part of a line.
-            whole = bool(good and fits[0] and good[0] is lines[0])
-            self._losses += len(lines) - len(values) - (not (self._synchronised or whole))
+            begun = self._synchronised or bool(good and fits[0] and good[0] is lines[0])
+            self._losses += len(lines) - len(values) - (not begun)
             self._synchronised = True
         self._kept += sum(len(line) + 1 for line, fit in zip(good, fits, strict=True) if fit)
         self._telegrams += len(values)
@@ -286,12 +288,6 @@ class LineDecoder:
         """Return the counts of bytes, telegrams, and damaged lines."""
         counts = {"telegrams": self._telegrams, "losses_of_sync": self._losses}
         return WireCounts(self._received, self._kept, len(self._tail), **counts)
-
-    def _fitting(self, values: FloatArray) -> NDArray[np.bool_]:
-        """Return which rows of ``values`` (n, signals) fit the signals' types, shape (n,)."""
-        lowest, highest, whole = self._limits
-        inside = (values >= lowest) & (values <= highest)
-        return np.asarray((inside & (~whole | (values == np.rint(values)))).all(axis=1))
 
 
 def _limits(layout: Layout) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
