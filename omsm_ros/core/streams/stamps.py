@@ -68,15 +68,10 @@ class StampClock:
         return np.asarray((whole + fine) / NANOSECONDS_PER_S, np.float64)
 
 
-def stamps_of(blocks: Sequence[Block]) -> IntArray:
-    """Return the first counts and stamps [ns] of all messages in ``blocks``, (k, 2)."""
-    return np.concatenate([block.stamps for block in blocks])
-
-
 def fit_clock(blocks: Sequence[Block]) -> StampClock:
     """Return the line through the stamps of a session; DataError if they contradict the period."""
     nominal = blocks[0].sample_period * NANOSECONDS_PER_S
-    stamps = stamps_of(blocks)
+    stamps = np.concatenate([block.stamps for block in blocks])  # (k, 2)
     clock = StampClock.through(stamps, nominal)
     drift, limit = abs(clock.period_ns - nominal), _MAX_RATE_ERROR * nominal
     if drift > limit + _COVERAGE * clock.period_uncertainty_ns:

@@ -164,8 +164,7 @@ class TriggerSlipDetector:
         self._seen = StampHistory(_MOST_STAMPS)
         # Skew at each verdict of the last half minute without a slip [ns].
         self._wander: deque[float] = deque(maxlen=round(_WANDER_S / _STRIDE_S))
-        # The usual skew, and the change of a single one that may be a slip [ns].
-        self._usual, self._change = math.nan, math.inf
+        self._usual = math.nan  # skew [ns]
 
     @property
     def state(self) -> TriggerSlip:
@@ -256,8 +255,15 @@ class TriggerSlipDetector:
             self.same_stamps = False
             return
         self._period_ns, per_s = period_ns, NANOSECONDS_PER_S / period_ns
-        off = bool(self._off(np.array(skew)))
-        self._note(count, skew, begun, off)
+        changed = abs(skew - self._usual) >= period_ns / 2  # False while none is usual
+        off = (changed or abs(skew) >= period_ns / 2) and bool(self._off(np.array(skew)))
+        first = not any(self._stamps)
+        self.same_stamps = abs(skew) <= _SAME_NS and (first or self.same_stamps)
+        for stream in (0, 1):
+            self._stamps[stream] += begun[stream]
+            if begun[stream] and not off:
+                self._shown[stream] = count
+        self._odd_at = count if off else self._odd_at
         stride = int(count // max(_STRIDE_S * NANOSECONDS_PER_S / period_ns, 1.0))
         judged, self._judged = self._judged, stride
         early_days = count - self._start < _FIRST_S * per_s
@@ -265,37 +271,19 @@ class TriggerSlipDetector:
             if not early_days:
                 self._since = count - _SPAN_S * per_s
                 self._judge(count)
-            if not self._state.samples:
-                self._note_usual(skew)
+            if not self._state.samples:  # a slip in the newest ones is not found yet
+                self._wander.append(skew)
+                if len(self._wander) >= 3 * _FOUND_IN:
+                    self._usual = median(np.array([*self._wander][-2 * _FOUND_IN : -_FOUND_IN]))
         time = axes.stamp_of(a, count, period_ns) or 0.0
         self._seen.add(count, skew, *begun, time)
         self._odd |= off and not early_days
 
-    def _note(self, count: int, skew: float, begun: tuple[bool, bool], off: bool) -> None:
-        """Keep the skew of one stamp for the streams whose blocks have ``begun`` there."""
-        first = not any(self._stamps)
-        self.same_stamps = abs(skew) <= _SAME_NS and (first or self.same_stamps)
-        for stream in (0, 1):
-            if begun[stream]:
-                self._stamps[stream] += 1
-                if not off:
-                    self._shown[stream] = count
-        if off:
-            self._odd_at = count
-
-    def _note_usual(self, skew: float) -> None:
-        """Keep a skew [ns] that is none of a slip; a slip in the newest ones is not found yet."""
-        self._wander.append(skew)
-        wander = np.array(self._wander)
-        if len(wander) >= 3 * _FOUND_IN:
-            self._usual = median(wander[-2 * _FOUND_IN : -_FOUND_IN])
-            scatter = max(spread_about_median(wander), _clock_uncertainty(wander))
-            self._change = self._period_ns / 2 + _SEVERAL_TIMES * scatter
-
     def _off(self, skew: FloatArray) -> BoolArray:
         """Return which ``skew`` (n,) of single stamps [ns] may be of a slip."""
+        limit = self._period_ns / 2 + _SEVERAL_TIMES * _scatter(np.array(self._wander))
         far = abs(skew) >= self._steady() * self._period_ns
-        return np.asarray(far | (abs(skew - self._usual) >= self._change))
+        return np.asarray(far | (abs(skew - self._usual) >= limit))
 
     def _judge(self, count: int) -> None:
         if not (self._odd or self._state.samples or self._starting):
@@ -327,11 +315,8 @@ class TriggerSlipDetector:
 
     def _limit(self, window: FloatArray) -> float:
         """Return the skew that is a slip [samples]."""
-        wander = np.array(self._wander) / self._period_ns
-        scatter = max(
-            spread_about_median(window), spread_about_median(wander), _clock_uncertainty(wander)
-        )
-        return self._steady() + _SEVERAL_TIMES * scatter
+        scatter = _scatter(np.array(self._wander) / self._period_ns)
+        return self._steady() + _SEVERAL_TIMES * max(spread_about_median(window), scatter)
 
     def _verdict(self, window: FloatArray, above: float | None = None) -> TriggerSlip:
         """Return the verdict on the skews ``window`` (n,) [samples].
@@ -350,11 +335,14 @@ class TriggerSlipDetector:
         return replace(found, seen_from=math.ceil(limit)) if found.samples else found
 
 
-def _clock_uncertainty(wander: FloatArray) -> float:
-    """Return the error that clocks with the skews ``wander`` (n,) may still have.
+def _scatter(wander: FloatArray) -> float:
+    """Return the scatter of the skews ``wander`` (n,), at least the error their clocks may have.
 
     A slip in the newest skews is not a movement of clocks.
     """
+    if not len(wander):
+        return 0.0
     known = wander[:-_FOUND_IN]
     arrivals = np.arange(1, len(known) + 1) / len(wander)
-    return float(np.max(abs(known - known[-1:]) * arrivals, initial=0.0))
+    uncertainty = float(np.max(abs(known - known[-1:]) * arrivals, initial=0.0))
+    return max(spread_about_median(wander), uncertainty)

@@ -24,7 +24,7 @@ from omsm_ros.core.streams.blocks import (
 from omsm_ros.core.streams.continuity import TriggerCount
 from omsm_ros.core.streams.monitoring import LoadMeter, Playback, RecentIncrease, SampleFlow
 from omsm_ros.core.streams.motion_record import BlockBuffer
-from omsm_ros.core.streams.stamps import StampClock, fit_clock, period_fault, stamps_of
+from omsm_ros.core.streams.stamps import StampClock, fit_clock, period_fault
 from omsm_ros.core.streams.statistics import (
     EvenSelection,
     RunningScatter,
@@ -208,14 +208,14 @@ class TestClocks:
         count = np.array([b.first_sample for b in blocks]) - 1_000_000
         stamps = np.array([b.stamp_ns - 5_000_000_000 for b in blocks]) / 1e9
         (slope, _), covariance = np.polyfit(count, stamps, 1, cov=True)
-        found = StampClock.through(stamps_of(blocks), PERIOD * 1e9)
+        found = StampClock.through(np.concatenate([b.stamps for b in blocks]), PERIOD * 1e9)
         assert found.period_ns == pytest.approx(1e9 * slope, rel=1e-9)
         assert found.period_uncertainty_ns == pytest.approx(
             1e9 * np.sqrt(covariance[0, 0]), rel=1e-6
         )
 
     def test_blocks_of_one_count_have_no_period(self):
-        assert period_fault("probe", stamps_of([distance(5)] * 6), PERIOD) is None
+        assert period_fault("probe", np.tile(distance(5).stamps, (6, 1)), PERIOD) is None
 
     def test_stamps_that_a_stated_offset_or_tolerance_explains_are_no_fault(self):
         axes, probe = StreamWatch(), StreamWatch()
