@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import difflib
+import itertools
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -36,6 +38,16 @@ class OneLineParser(argparse.ArgumentParser):
     """
 
     word = ""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse; a misspelt option is named before what is missing because of it."""
+        own = () if self._subparsers else args or ()  # of a command, not of the program
+        for text in itertools.takewhile("--".__ne__, own):
+            option = text.partition("=")[0] if text.startswith("--") else ""
+            near = difflib.get_close_matches(option, self._option_string_actions, 1)
+            if near and not any(known.startswith(option) for known in self._option_string_actions):
+                self.error(f"{option!r}: unknown option, did you mean {near[0]!r}?")
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Raise UsageError instead of printing and exiting."""

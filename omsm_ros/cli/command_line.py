@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import errno
 import importlib
 import io
@@ -21,7 +22,7 @@ from typing import TYPE_CHECKING
 
 from omsm_ros import __version__
 from omsm_ros.cli import INTERRUPTED, INTERRUPTION, interruptible
-from omsm_ros.cli.arguments import Arguments, OneLineParser
+from omsm_ros.cli.arguments import Arguments, OneLineParser, UsageError
 from omsm_ros.cli.command import CliCommand, null_device, say, say_lines, table, warn, written
 from omsm_ros.cli.words import TASKS, WORDS
 from omsm_ros.errors import (
@@ -291,6 +292,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         own, passed_on = _split(given)
         named = [a for a in own if a in WORDS][:1]
+        if not named and (near := difflib.get_close_matches(own[0], WORDS, 1)):
+            raise UsageError(f"{own[0]!r}: unknown command, did you mean {near[0]!r}?")
         args = parser_of(named).parse_args(own)
         args.passed_on = passed_on
         return _run(args)

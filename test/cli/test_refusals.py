@@ -171,6 +171,23 @@ def test_an_option_that_would_do_nothing_is_refused(capsys, tmp_path, calibratio
     assert said in refused(capsys, *words, *options)
 
 
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (["corect", "--calibration"], "'correct'"),
+        (["correct", "s.mcap", "--calibraton", "c.json"], "'--calibration'"),
+        (["correct", "s.mcap", "--outt=o", "--calibration", "c.json"], "'--out'"),
+    ],
+)
+def test_a_misspelt_word_is_named_before_what_is_missing_because_of_it(capsys, words, meant):
+    assert f"did you mean {meant}" in refused(capsys, *words)
+
+
+def test_a_word_without_hyphens_is_no_option(capsys):
+    said = refused(capsys, "correct", "calibration", "--out", "help")
+    assert "required: --calibration" in said
+
+
 def test_a_file_without_a_length_is_no_cloud(capsys, tmp_path):
     assert "/proc/cpuinfo" in refused(
         capsys, "export", "/proc/cpuinfo", "--out", tmp_path / "a.csv"
