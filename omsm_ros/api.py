@@ -327,11 +327,11 @@ def plan(
     nominal: Surface | None = None,
     *,
     period: float = 1e-3,
-    rpm: float = 30.0,
-    radius: float = 12.7e-3,
-    feed: float = 1e-4,
+    rpm: float | None = None,
+    radius: float | None = None,
+    feed: float | None = None,
     dialect: str = "linuxcnc",
-    **steps: Any,
+    **steps: float,
 ) -> Plan:
     """Plan a step test, or a scan of ``nominal`` from ``radius`` to the centre.
 
@@ -342,15 +342,16 @@ def plan(
     period
         Sample period [s].
     rpm
-        Speed of the spindle [1/min].
+        Speed of the spindle in a scan [1/min]; 30 unless stated.
     radius
-        Radius at the start [m].
+        Radius at the start of a scan [m]; 12.7 mm unless stated.
     feed
-        Feed per turn [m].
+        Feed per turn of a scan [m]; 0.1 mm unless stated.
     dialect
         Of the controller: ``linuxcnc``, ``fanuc``, ``siemens`` or ``nanotech``.
     **steps
-        ``step``, ``second_step``, ``half_range`` [m], ``count``, ``dwell``, ``rise`` [s].
+        Of a step test: ``step``, ``second_step``, ``half_range`` [m], ``count``, ``dwell``,
+        ``rise`` [s].
 
     Returns
     -------
@@ -360,7 +361,7 @@ def plan(
     Raises
     ------
     ConfigurationError
-        For a motion that the probe or the sampling cannot follow.
+        For a motion that the probe or the sampling cannot follow, or arguments of the other kind.
 
     Examples
     --------
@@ -374,6 +375,11 @@ def plan(
 
     if dialect not in DIALECTS:
         raise ConfigurationError(f"dialect {dialect!r} is none of {', '.join(DIALECTS)}")
+    asked = {"rpm": rpm, "radius": radius, "feed": feed}
+    stated = {name: value for name, value in asked.items() if value is not None}
+    if wrong := (stated if nominal is None else steps):
+        kind, remedy = ("scan", "give") if nominal is None else ("step test", "leave out")
+        raise ConfigurationError(f"{', '.join(wrong)}: of a {kind}; {remedy} the nominal surface")
     if nominal is None:
         step = steps.get("step", 9.8e-6)
         usual = {"step": step, "second_step": motions.SECOND_SHARE * step,
@@ -382,7 +388,10 @@ def plan(
         z = test.z(np.arange(0.0, test.duration, period, dtype=np.float64))
         zero = np.zeros(len(z))
         return Plan(z=z, x=zero, c=zero, period=period, gcode=steps_gcode(test, dialect))
-    design = ScanDesign(rpm=rpm, start=radius, end=0.0, pitch=feed, rate=1 / period, **steps)
+    spiral = {"rpm": 30.0, "radius": 12.7e-3, "feed": 1e-4} | stated
+    design = ScanDesign(
+        rpm=spiral["rpm"], start=spiral["radius"], end=0.0, pitch=spiral["feed"], rate=1 / period
+    )
     x, z, c = scan_path(design, nominal, np.arange(0.0, design.duration, period, dtype=np.float64))
     program = scan_program(design, nominal, dialect=dialect)[1]
     return Plan(z=z, x=x, c=c, period=period, gcode=program)

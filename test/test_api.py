@@ -241,6 +241,10 @@ def test_a_plan_is_the_motion_of_its_program(results):
     assert np.ptp(plan.c) == pytest.approx(2 * np.pi * 30 / 60 * plan.time[-1])
     with pytest.raises(ConfigurationError, match="none of linuxcnc"):
         omsm.plan(dialect="heidenhain")
+    with pytest.raises(ConfigurationError, match="rpm, feed: of a scan; give the nominal surface"):
+        omsm.plan(rpm=30, feed=1e-4)
+    with pytest.raises(ConfigurationError, match="step: of a step test; leave out the nominal"):
+        omsm.plan(omsm.surface("flat"), step=1e-6)
     # Its lag makes the error that is predicted: lag times the speed of Z, but for the settling.
     error = results[8].error
     expected = results[0].lag * np.gradient(plan.z, plan.period)[-len(error) :]
