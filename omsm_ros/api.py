@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.interface_inputs import Calibration, load
+from omsm_ros.interface_inputs import Calibration, bounded, load
 from omsm_ros.interface_inputs import read as read
 from omsm_ros.interface_inputs import simulate as simulate
 from omsm_ros.interface_inputs import surface as surface
@@ -37,7 +37,22 @@ from omsm_ros.interface_results import (
     Recording,
     Spectrum,
 )
-from omsm_ros.quantities import shown
+from omsm_ros.quantities import (
+    BUDGET,
+    COUNT,
+    DWELL,
+    FEED,
+    LAG,
+    ORDER,
+    RADIUS,
+    RISE,
+    SAMPLE_PERIOD,
+    SPEED,
+    STEP,
+    TOLERANCE,
+    UNCERTAINTY,
+    shown,
+)
 
 if TYPE_CHECKING:
     from omsm_ros.core.kinematics.kinematics import Surface
@@ -51,6 +66,7 @@ def _checked(value: Any, kind: type) -> Any:
     raise ConfigurationError(f"{shown(value)} is no {kind.__name__}; use omsm.read or omsm.load")
 
 
+@bounded(period=SAMPLE_PERIOD, order=ORDER)
 def identify(
     recording: Recording | ArrayLike,
     distance: ArrayLike | None = None,
@@ -101,6 +117,7 @@ def identify(
     return Calibration(identify_record(record, order=order, settings=settings).calibration)
 
 
+@bounded(latency=LAG)
 def correct(
     recording: Recording,
     calibration: Calibration,
@@ -196,6 +213,7 @@ def form(
     return Form.of(found.map, figures=figures, zernike=zernike)
 
 
+@bounded(accuracy=BUDGET, tolerance=TOLERANCE)
 def adjust(
     scans: Sequence[Recording | Path | str],
     calibration: Calibration,
@@ -257,6 +275,7 @@ def adjust(
     return Adjusted.of(found.form, facts=facts)
 
 
+@bounded(uncertainty=UNCERTAINTY)
 def difference(
     a: Points | Path | str,
     b: Points | Path | str,
@@ -323,6 +342,10 @@ def difference(
     return Difference.of(matched, facts=facts_of(found), uncertainty=spread)
 
 
+@bounded(
+    period=SAMPLE_PERIOD, rpm=SPEED, radius=RADIUS, feed=FEED,
+    step=STEP, second_step=STEP, half_range=STEP, count=COUNT, dwell=DWELL, rise=RISE,
+)  # fmt: skip
 def plan(
     nominal: Surface | None = None,
     *,
@@ -397,6 +420,7 @@ def plan(
     return Plan(z=z, x=x, c=c, period=period, gcode=program)
 
 
+@bounded(accuracy=BUDGET)
 def predict(
     motion: Plan | Recording, calibration: Calibration, *, accuracy: float = 20e-9
 ) -> Prediction:
@@ -435,6 +459,7 @@ def predict(
     return Prediction.of(found, error=error, period=motion.period)
 
 
+@bounded(step=STEP)
 def spectrum(values: ArrayLike, step: float) -> Spectrum:
     """Return the power spectral density of evenly spaced values, their mean removed.
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +18,7 @@ from omsm_ros.core.lti.transfer_function import TransferFunction, to_control
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, on_counts
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.interface_results import Points, Recording, Result, load_saved
+from omsm_ros.quantities import RADIUS, SEED, SPEED, Quantity
 from omsm_ros.readable import measured, plain, quantity
 
 if TYPE_CHECKING:
@@ -23,6 +26,31 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from omsm_ros.core.kinematics.kinematics import Surface
+
+
+_Task = TypeVar("_Task", bound=Callable[..., Any])
+
+
+def bounded(**quantities: Quantity) -> Callable[[_Task], _Task]:
+    """Return a decorator: an argument outside its quantity is a ConfigurationError with its name.
+
+    None is not stated and always passes.
+    """
+
+    def decorate(task: _Task) -> _Task:
+        signature = inspect.signature(task)
+
+        @functools.wraps(task)
+        def checked(*args: Any, **named: Any) -> Any:
+            given = signature.bind(*args, **named).arguments | named
+            for name in given.keys() & quantities.keys():
+                if given[name] is not None:
+                    quantities[name].checked(given[name], ConfigurationError, name)
+            return task(*args, **named)
+
+        return cast("_Task", checked)
+
+    return decorate
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -249,6 +277,7 @@ def surface(shape: str | Path, **parameters: Any) -> Surface:
     return surface_of({"shape": str(shape), **parameters}, f"surface {shape!r}")
 
 
+@bounded(seed=SEED, part=SEED, rpm=SPEED, radius=RADIUS)
 def simulate(
     motion: str = "scan",
     *,
@@ -278,7 +307,7 @@ def simulate(
     Raises
     ------
     ConfigurationError
-        For another motion.
+        For another motion, or a scan beyond the mirror or of too many samples.
 
     Examples
     --------
@@ -286,11 +315,13 @@ def simulate(
     recording  20000 samples, 20.0 s
     from       twin, seed 1
     """
+    from omsm_ros.pipelines.record_bags import check_scenario
     from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of
 
     scenario = Scenario(
         seed=seed, spindle_speed=rpm, start_radius=radius, outward=outward, part_seed=part
     )
+    check_scenario(scenario)
     motions = {"scan": scan_of, "step_test": planned_test_of}
     if motion not in motions:
         raise ConfigurationError(f"motion {motion!r} is unknown, expected one of {[*motions]}")

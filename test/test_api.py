@@ -235,6 +235,36 @@ def test_the_examples_of_the_functions_run(results, monkeypatch, tmp_path):
         assert "\nParameters\n----------\n" in inspect.getdoc(getattr(omsm, name))
 
 
+FLAT = omsm.surface("flat")
+NUMBERS = {
+    "period": lambda v: omsm.plan(period=v),
+    "rpm": lambda v: omsm.plan(FLAT, rpm=v),
+    "radius": lambda v: omsm.plan(FLAT, radius=v),
+    "feed": lambda v: omsm.plan(FLAT, feed=v),
+    "step": lambda v: omsm.plan(step=v),
+    "count": lambda v: omsm.plan(count=v),
+    "part": lambda v: omsm.simulate(part=v),
+    "accuracy": lambda v: omsm.predict(None, None, accuracy=v),
+    "tolerance": lambda v: omsm.adjust([], None, tolerance=v),
+    "latency": lambda v: omsm.correct(None, None, latency=v),
+    "order": lambda v: omsm.identify([], [], order=v),
+    "uncertainty": lambda v: omsm.difference(None, None, uncertainty=v),
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300, "1", True])
+def test_a_number_that_cannot_be_is_named_with_its_range(name, value):
+    with pytest.raises(ConfigurationError, match=rf"^{name} is .*, expected .* from "):
+        NUMBERS[name](value)
+
+
+@pytest.mark.parametrize("asked", [{"rpm": 1e-3}, {"radius": 1.0}])
+def test_a_simulation_that_is_too_large_is_refused(asked):
+    with pytest.raises(ConfigurationError, match="expected at most"):
+        omsm.simulate(**asked)
+
+
 def test_a_plan_is_the_motion_of_its_program(results):
     plan = results[7]
     assert plan.gcode.endswith("M2\n")

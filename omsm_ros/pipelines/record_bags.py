@@ -129,7 +129,7 @@ def record_twin(
     Return their paths and numbers of samples. Raises BagError if a bag of that name exists,
     ConfigurationError for a scan beyond the mirror or too long for memory.
     """
-    _check(scenario)
+    check_scenario(scenario)
     wrong = load_disturbances(disturbance_file)
     steps = _write(out / STEPS, planned_test_of(scenario, wrong))
     scan = _write(out / SCAN, scan_of(scenario, wrong))
@@ -150,11 +150,12 @@ def record_sources(
     }
 
 
-def _check(scenario: Scenario) -> None:
+def check_scenario(scenario: Scenario) -> None:
+    """Raise ConfigurationError for a scan beyond the twin's mirror, or of too many samples."""
     if scenario.start_radius > PAPER_MIRROR_HALF_LENGTH_M:
         raise ConfigurationError(
-            f"radius is {quantity(scenario.start_radius, 'm')}, expected at most that of the "
-            f"twin's mirror, {quantity(PAPER_MIRROR_HALF_LENGTH_M, 'm')}; give it in metres"
+            f"radius is {quantity(scenario.start_radius, 'm', 4)}, expected at most that of the "
+            f"twin's mirror, {quantity(PAPER_MIRROR_HALF_LENGTH_M, 'm', 4)}; give it in metres"
         )
     samples = spiral_of(scenario).duration / scenario.sample_period
     if samples > _MOST_SAMPLES:
