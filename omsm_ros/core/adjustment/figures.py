@@ -469,8 +469,7 @@ def _resembled(
 ) -> list[tuple[str, FloatArray]]:  # fmt: skip
     """Return families that the scans leave open and that the form speaks for, likeliest first.
 
-    Each has its name, and its change of the map as one standard uncertainty (n,) [m]: as far as the
-    form shows it, for no part cancels an error of the machine.
+    Each has its name, and its change of the map as one standard uncertainty (n,) [m].
     """
     if not np.any(made.height):
         return []
@@ -489,10 +488,6 @@ def _resembled(
             # Rounding of its many components would pass for information.
             shape, known = shape @ family.smooth, np.zeros((family.smooth.shape[1],) * 2)
         gain, values = form.looks_like(fit @ shape, known)
-        change = shape @ values
-        weight = made.places.area * change
-        shown = weight @ made.height / np.maximum(weight @ change, 1e-30)
-        found.append((family.name, gain, float(np.clip(shown, 0.0, 1.0)) * change))
+        found.append((family.name, gain, shape @ values))
     probable = probabilities([gain for _, gain, _ in found])
-    return [(found[k][0], np.sqrt(probable[k]) * found[k][2])
-            for k in np.argsort(-probable) if probable[k]]  # fmt: skip
+    return [(found[k][0], np.sqrt(probable[k]) * found[k][2]) for k in np.argsort(-probable)]

@@ -37,8 +37,6 @@ _MOST_RELEASED = 8
 _MOST_TRIED = 3
 # Prior odds against an error that is not declared, and against a wrong declaration in a machine.
 ODDS_ABSENT, SURE = 9.0, 50.0
-# A smaller probability lies outside an interval of 95 %.
-_LEAST_LIKELY = 0.05
 # With a smaller prior, the information of the scans on a family would be lost in rounding.
 _LEAST_PROBABLE = 1e-6
 # Starting values; each step moves a variance by 30 at most, and four are enough for 2 %.
@@ -345,13 +343,11 @@ def probabilities(gains: Sequence[float]) -> FloatArray:
     """Return the probability that each of several declarations is the one that is wrong, (k,).
 
     The prior odds are shared equally, so that many declarations do not make one that looks wrong
-    by chance more probable (J. G. Scott, J. O. Berger, Ann. Statist. 38, 2587). Probabilities
-    below 5 % are 0.
+    by chance more probable (J. G. Scott, J. O. Berger, Ann. Statist. 38, 2587).
     gains: of their likelihoods (k,)
     """
     odds = np.exp(np.minimum(gains, SURE) / 2)
-    found = odds / (ODDS_ABSENT * max(len(odds), 1) + np.sum(odds))
-    return np.asarray(np.where(found > _LEAST_LIKELY, found, 0.0))
+    return np.asarray(odds / (ODDS_ABSENT * max(len(odds), 1) + np.sum(odds)))
 
 
 def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Solution:
@@ -359,23 +355,22 @@ def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Sol
 
     A family that is neither declared nor significant may be present, as large as the residuals and
     its plausible size allow. The uncertainty of the form contains its mean square: the square of
-    that size times the probability that it is present (Hoeting et al., Statist. Sci. 14, 382). The
-    same holds for a declaration that the scans doubt but do not refute: it may be wrong by the
-    found value. Families that explain a part of the evidence count by that part, because no model
-    is exact and the likelihood alone would be overconfident.
+    that size times the probability that it is present (Hoeting et al., Statist. Sci. 14, 382). A
+    declared size from which the scans differ by more than both are uncertain is larger by the ratio
+    (R. T. Birge, Phys. Rev. 40, 207). Families that explain a part of the evidence count by that
+    part, because no model is exact and the likelihood alone would be overconfident.
     """
     sizes: dict[str, float | FloatArray] = dict(solution.sizes)
-    named = [evidence_of(solution, f) for f in solution.network.families if f.named]
-    for one in named:
-        if not one.declared:
-            probable = 1 / (1 + ODDS_ABSENT * np.exp(-min(one.gain, SURE) / 2))
-            root = np.sqrt(max(probable, _LEAST_PROBABLE))
-            size = root * np.hypot(one.values, one.uncertainty)
-            sizes[one.family.name] = np.minimum(size, one.family.wide)
-    doubted = [e for e in named if e.declared and e.shown]
-    for one, probable in zip(doubted, probabilities([e.gain for e in doubted]), strict=True):
+    for one in (evidence_of(solution, f) for f in solution.network.families if f.named):
         name = one.family.name
-        sizes[name] = np.hypot(sizes[name], np.sqrt(probable) * one.values)
+        if one.declared:
+            ratio = one.chi_square / max(one.dof, 1)
+            sizes[name] = np.sqrt(max(ratio, 1.0)) * sizes[name]
+            continue
+        probable = 1 / (1 + ODDS_ABSENT * np.exp(-min(one.gain, SURE) / 2))
+        root = np.sqrt(max(probable, _LEAST_PROBABLE))
+        size = root * np.hypot(one.values, one.uncertainty)
+        sizes[name] = np.minimum(size, one.family.wide)
     for refutation in refutations:
         for other in refutation.rivals:
             share = explained(other, refutation.evidence)

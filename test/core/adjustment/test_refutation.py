@@ -229,7 +229,7 @@ def test_an_accepted_value_refutes_no_more():
 
 def test_a_clocking_that_was_declared_counts_as_the_source_that_it_is():
     """A freeform turned on the chuck looks like form, so the light and the advice name it."""
-    _, made = drawn(3, 2)
+    _, made = drawn(4, 2)
     priors = [p for p in AS_DRAWN if p.name != "clocking"]
     found = adjust(made, [*priors, Source("clocking", 1e-4, evaluated=True)], nominal=MIRROR,
                    accuracy=25e-9)  # fmt: skip
