@@ -54,7 +54,8 @@ ASTIGMATISM, COMA = 50 * NANOMETRE_M, 15 * NANOMETRE_M
 DUST, DUST_SHARE = 5e-6, 1e-3
 POSE_PARAMETERS = ("x", "y", "piston", "tip", "tilt", "clocking")
 SHIFT, TURN = 0.5 * MILLIMETRE_M, 0.5 * DEGREE_RAD
-MAPS = Path(__file__).parents[2] / "shared" / "data" / "surfaces"
+ROOT = Path(__file__).parents[1]
+MAPS = ROOT.parent / "shared" / "data" / "surfaces"
 
 
 @dataclass(frozen=True)
@@ -248,7 +249,7 @@ def _map() -> list[Row]:
 
 
 # Python of the environment of the peers, which `make bench` makes.
-PEERS = Path(os.environ.get("OMSM_SURFACE_PEERS", ".venv/peers/bin/python"))
+PEERS = Path(os.environ.get("OMSM_SURFACE_PEERS", ROOT / ".venv/peers/bin/python"))
 
 
 def _made_maps() -> dict[str, tuple[FloatArray, float, float]]:
@@ -283,11 +284,7 @@ def _peers() -> list[Row]:
         across = (np.linspace(-1, 1, size + 2)[1:-1] for size in z.shape)
         away = np.hypot(*np.meshgrid(*across, indexing="ij"))
         window = np.cos(np.pi / 2 * np.minimum(away, 1.0)) ** 2
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "map.npz"
-            np.savez(file, z=z, dx=dx, dy=dy, band=band, window=window)
-            command = [str(PEERS), str(Path(__file__).with_name("surface_peers.py")), str(file)]
-            done = subprocess.run(command, capture_output=True, text=True, check=True)
+        found_by_peers = _by_peers(z=z, dx=dx, dy=dy, band=band, window=window)
         y, x = np.indices(z.shape) * np.reshape([dy, dx], (2, 1, 1))
         many, none = np.ones(z.size), np.empty((0, z.size))
         map_ = DeviationMap(
@@ -300,7 +297,7 @@ def _peers() -> list[Row]:
         f = np.hypot(density.x[np.newaxis], density.y[:, np.newaxis])
         inside = (f >= band[0]) & (f <= band[1])
         ours["in_band"] = float(np.sum(density.areal[inside])) / (z.size * dx * dy)
-        for peer, found in json.loads(done.stdout.splitlines()[-1]).items():
+        for peer, found in found_by_peers.items():
             for figure, value in found.items():
                 label = f"{name}: {figure} off {peer} by"
                 if figure == "error":
@@ -316,6 +313,16 @@ def _peers() -> list[Row]:
         spacing = max(dx, dy) / MILLIMETRE_M
         table.append(shown(f"{name}: slope_rms over Sdq of {spacing:.3g} mm", ratio, "1"))
     return table
+
+
+def _by_peers(**content: Any) -> dict[str, Any]:
+    """Return what the program for the peers prints about the ``content``, in their environment."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "content.npz"
+        np.savez(file, **content)
+        command = [str(PEERS), str(Path(__file__).with_name("surface_peers.py")), str(file)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return dict(json.loads(done.stdout.splitlines()[-1]))
 
 
 def _zernike_speed() -> list[Row]:
@@ -350,18 +357,11 @@ def _zernike_speed() -> list[Row]:
 
 
 def _prysm(x: FloatArray, y: FloatArray, value: FloatArray, mine: float) -> Row:
-    name = "37 terms with covariance, times as fast as prysm"
-    try:
-        from prysm import polynomials
-    except Exception as err:  # its release fails to import in ways of its own
-        return not_compared(name, "1", ">= 2", f"prysm: {type(err).__name__}")
-    begin = process_time()
-    r, angle = np.hypot(x, y) / RADIUS, np.arctan2(y, x)
-    # Releases and the source name it differently.
-    sequence = getattr(polynomials, "zernike_nm_seq", None) or polynomials.zernike_nm_sequence
-    modes = list(sequence([tuple(t) for t in first_terms(37)], r, angle))
-    polynomials.lstsq(modes, value)
-    return at_least(name, (process_time() - begin) / mine, "1", 2.0, "prysm")
+    name, terms = "37 terms with covariance, times as fast as prysm", first_terms(37)
+    if not PEERS.is_file():
+        return not_compared(name, "1", ">= 2", f"no environment of peers at {PEERS}")
+    found = _by_peers(x=x / RADIUS, y=y / RADIUS, value=value, terms=terms)
+    return at_least(name, found["time"] / mine, "1", 2.0, "prysm")
 
 
 def _whole_process(full: bool) -> list[Row]:

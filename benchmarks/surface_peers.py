@@ -2,11 +2,14 @@
 
 Run by ``benchmarks.form`` with the Python of that environment: ``surface_peers.py MAP.npz``. Prints
 one JSON object of Sa, Sq, Sz [m], Sdq [1] and mean square in a band [m²] for each peer. Both peers
-take Sdq from the differences of neighbouring points; prysm is given the window of the density.
+take Sdq from the differences of neighbouring points; prysm is given the window of the density. For
+points x, y of the unit disc with "terms" (n, m) it is the processor time [s] of prysm's fit, and
+its coefficients.
 """
 
 import json
 import sys
+import time
 import warnings
 
 import numpy as np
@@ -48,8 +51,21 @@ def _psd(psd, z, dx, window):
     return fy, fx, density
 
 
+def zernike_fit(x, y, value, terms):
+    from prysm import polynomials
+
+    begin = time.process_time()
+    r, angle = np.hypot(x, y), np.arctan2(y, x)
+    modes = list(polynomials.zernike_nm_sequence([(int(n), int(m)) for n, m in terms], r, angle))
+    found = polynomials.lstsq(modes, value)
+    return {"time": time.process_time() - begin, "coefficients": list(map(float, found))}
+
+
 def main(path):
     content = np.load(path)
+    if "terms" in content:
+        print(json.dumps(zernike_fit(*(content[name] for name in ("x", "y", "value", "terms")))))
+        return
     given = (
         content["z"],
         float(content["dx"]),

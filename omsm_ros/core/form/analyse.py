@@ -18,7 +18,7 @@ from omsm_ros.core.form.deviation_map import (
     profile_noise,
     repeated_noise,
 )
-from omsm_ros.core.form.part_extents import MOST_UNSEEN, extents_of_parts
+from omsm_ros.core.form.part_extents import MOST_UNSEEN, Gaps, extents_of_parts
 from omsm_ros.core.form.part_figures import (
     FORM,
     POWER,
@@ -42,7 +42,7 @@ from omsm_ros.core.form.texture import (
     profiles,
     texture,
 )
-from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
+from omsm_ros.core.form.zernike_fit import RimStrip, ZernikeFit, fit_zernikes
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule
 from omsm_ros.core.registration.placement import Placed, PointBatch, PointBatches, placed
@@ -86,20 +86,20 @@ def with_pose_uncertainty(fit: ZernikeFit, map_: DeviationMap, found: Registrati
         [found.displaced(few.x, few.y), found.undetermined_displacements(few.x, few.y)]
     )
     changes = -np.einsum("rin,in->rn", moves, np.stack(list(slopes)))
-    made = fit_zernikes(
-        few.x, few.y, few.deviation, fit.terms, fit.disc, weights=few.area, effects=changes
-    )
-    if made.terms != fit.terms:
-        return fit
-    effects = made.effects
+    root = np.sqrt(few.area)
+    columns = zernike_values(*fit.disc.scaled(few.x, few.y), fit.terms)
+    effects = np.linalg.lstsq((columns * root).T, (changes * root).T, rcond=None)[0]
     effects[:, : fit.effects.shape[1]] += fit.effects
     return replace(fit, effects=effects)
 
 
-def optical_terms(smooth: SmoothTerms, fit: ZernikeFit) -> dict[str, UncertainValue]:
+def optical_terms(
+    smooth: SmoothTerms, fit: ZernikeFit, gaps: Gaps | None = None
+) -> dict[str, UncertainValue]:
     """Return the terms of ISO 10110-5 for deviations along the normal of the surface, each [m].
 
     smooth: SYMMETRIC terms of the map and others;  fit: of all its terms
+    gaps: between its points, None without any
 
     A (sagitta deviation) is the peak to valley of the power fitted together with piston and
     tilts; C that of the rotationally symmetric part of the rest. RMSt is the rms without piston
@@ -118,10 +118,14 @@ def optical_terms(smooth: SmoothTerms, fit: ZernikeFit) -> dict[str, UncertainVa
     return {
         "iso10110_A": _sagitta(map_, fit, float(best_sphere[-1, 0])),
         "iso10110_C": extents_of_parts([rings], fit.disc)[0][0],
-        "iso10110_RMSt": rms_of_part(smooth.without(TILT)),
-        "iso10110_RMSi": rms_of_part(smooth.without(POWER)),
-        "iso10110_RMSa": rms_of_part(smooth.without(SYMMETRIC)),
+        "iso10110_RMSt": _rms_to_rim(smooth.without(TILT), gaps),
+        "iso10110_RMSi": _rms_to_rim(smooth.without(POWER), gaps),
+        "iso10110_RMSa": _rms_to_rim(smooth.without(SYMMETRIC), gaps),
     }
+
+
+def _rms_to_rim(map_: DeviationMap, gaps: Gaps | None) -> UncertainValue:
+    return rms_of_part(map_, gaps.square(map_.deviation) if gaps else (0.0, 0.0))
 
 
 def _noise_of_rings(smooth: SmoothTerms) -> FloatArray:
@@ -222,24 +226,27 @@ def analyse_form(
         for begin in range(0, len(portion.x), CHUNK):
             gathered.add(PointBatch(*(v[..., begin : begin + CHUNK] for v in portion)))
     held = range(len(sources), found.moved.shape[1])  # Their offsets are upper bounds, too.
-    x, y = gathered.places
+    x, y = places = gathered.places
     uncovered, outline = best_covered(x, y, found.spacing, aperture or found.disc, aperture is None)
     bounded = [*[n for n, s in enumerate(sources) if s in bounds], *held]
     map_ = gathered.map(found, area_weights(x, y, even=even, outline=outline), bounded)
     smooth, terms = SmoothTerms.of(map_, found.disc, ZERNIKES), ZERNIKES[: len(map_) // 2]
+    strip = RimStrip.of(places, map_.area, outline, found.spacing, terms, found.disc)
     fit = fit_zernikes(
-        map_.x, map_.y, map_.deviation, terms, found.disc, weights=map_.area,
-        rim=(outline, found.spacing), sums=smooth.sums(terms),
+        map_.x, map_.y, map_.deviation, terms, found.disc,
+        weights=map_.area, strip=strip, sums=smooth.sums(terms),
     )  # fmt: skip
     zernike = with_pose_uncertainty(fit, map_, found)
     cells = GridCells.of(map_, even=even)
     bands = bands_of(cells, *filters)
-    figures, textures = _figures(smooth, cells, bands, found, outline, even)
+    gaps = Gaps.of(map_, outline, found.spacing, None if outline.outline == "annulus" else strip)
+    del strip  # it is as large as the map
+    figures, textures = _figures(smooth, zernike, cells, bands, outline, even, gaps)
     return FormResult(
         registration=found,
         aperture=outline,
         map=map_,
-        deviation=figures | gathered.as_measured(map_) | optical_terms(smooth, zernike) | textures,
+        deviation=figures | gathered.as_measured(map_) | textures,
         zernike=zernike,
         bands=bands,
         profiles=profiles(map_, found.disc),
@@ -252,31 +259,28 @@ def analyse_form(
 
 def _figures(
     smooth: SmoothTerms,
+    zernike: ZernikeFit,
     cells: GridCells,
     bands: Bands,
-    found: Registration,
     outline: Aperture,
     even: bool,
+    gaps: Gaps | None,
 ) -> tuple[dict[str, UncertainValue], dict[str, UncertainValue]]:
     """Return figures of the map, and its texture with slopes;  cells: of it."""
     map_, rest = smooth.map, smooth.without(SECOND_ORDER)
     rest_cells = GridCells.of(rest, even=even)
     maps = [map_, best_fit(map_), rest, smooth.without(POWER)]
-    extents = extents_of_parts(maps, found.disc, outline, found.spacing)
-    sizes = [rms_of_part(maps[k], extents[k][2]) for k in range(3)]
+    extents = extents_of_parts(maps, smooth.disc, gaps)
+    sizes = [_rms_to_rim(each, gaps) for each in maps[:3]]
     del maps, rest  # each is as large as the map
-    figures = {
+    figures = optical_terms(smooth, zernike, gaps) | {
         # Irregularity: the peak to valley without piston, tilts and power.
         "iso10110_B": extents[3][0],
-        "peak_to_valley": extents[0][0],
         "robust_peak_to_valley": extents[0][1],
-        "rms": sizes[0],
-        "peak_to_valley_best_fit": extents[1][0],
-        "rms_best_fit": sizes[1],
-        "peak_to_valley_without_second_order": extents[2][0],
-        "rms_without_second_order": sizes[2],
         "edge_roll_off": edge_roll_off(map_, outline),
     }
+    for k, name in enumerate(("", "_best_fit", "_without_second_order")):
+        figures |= {f"peak_to_valley{name}": extents[k][0], f"rms{name}": sizes[k]}
     points = smooth.without(FORM)
     formless = GridCells.of(points, even=even)
     # Without an S-filter the surface has waves that the cells do not resolve.
@@ -284,9 +288,9 @@ def _figures(
         return figures, texture(cells, formless, bands, None, rest_cells)
     points = short_waves(points, formless, bands.l_filter)
     textures = texture(cells, formless, bands, points, rest_cells)
-    edge = None if even else outline
-    [(whole, _, beyond)] = extents_of_parts([points], found.disc, edge, found.spacing)
-    return figures, textures | {"Sq": rms_of_part(points, beyond), "Sz": whole}
+    gaps = None if even else gaps
+    whole = extents_of_parts([points], smooth.disc, gaps)[0][0]
+    return figures, textures | {"Sq": _rms_to_rim(points, gaps), "Sz": whole}
 
 
 class _Gathered:
@@ -325,9 +329,11 @@ class _Gathered:
         self.least = min(self.least, float(points.deviation.min()))
         self.most = max(self.most, float(points.deviation.max()))
         self._noise.append((noise_of(points.deviation), path_noise(points.deviation)))
-        pose, along = self._found.effects(points, systematic)
-        rows = [points.x, points.y, points.deviation, *pose, *along]
-        self._kept.add(np.stack(rows, axis=1))
+        few = self._kept.chosen(len(points.x))
+        part = Placed(*(values[..., few] for values in points))
+        pose, along = self._found.effects(part, systematic[:, few])
+        rows = [part.x, part.y, part.deviation, *pose, *along]
+        self._kept.add_chosen(np.stack(rows, axis=1), len(points.x))
 
     @property
     def dust(self) -> FloatArray:

@@ -79,15 +79,8 @@ def compensation(map_: DeviationMap, surface: Surface, low_pass: float) -> Compe
     spread = np.sqrt(averaged * cells.present + np.sum(smooth[1:] ** 2, axis=0))
     x, y = np.meshgrid(cells.x, cells.y)
     along_z = np.where(cells.present, _along_z(surface, x, y), np.nan)
-    found = Compensation(
-        x=cells.x,
-        y=cells.y,
-        offset=np.asarray(-smooth[0] * along_z),
-        uncertainty=np.asarray(spread * along_z),
-        low_pass=low_pass,
-        before=0.0,
-        after=0.0,
-    )
+    offset, uncertainty = -smooth[0] * along_z, spread * along_z
+    found = Compensation(cells.x, cells.y, offset, uncertainty, low_pass, before=0.0, after=0.0)
     cut = found.between(map_.x, map_.y) / _along_z(surface, map_.x, map_.y)
     there = np.isfinite(cut)
     before = _rms(map_, map_.deviation, there)

@@ -291,21 +291,14 @@ class GridCells:
         weighted = [slopes * np.sqrt(count / max(slopes.shape[1], 1)) for slopes in found]
         return np.concatenate(weighted, axis=1)
 
+    def low_pass(self, cutoff: float) -> Callable[[FloatArray], FloatArray]:
+        """Return a Gaussian low-pass of ``cutoff`` [m] of images (…, r, c), also in empty cells."""
+        rows, columns, weight = self.weights(cutoff)
+        return lambda images: np.asarray(rows @ (images * self.present) @ columns / weight)
+
     def smoothed(self, images: FloatArray, cutoff: float) -> FloatArray:
         """Return images (…, r, c) after a Gaussian low-pass of ``cutoff`` [m] (ISO 16610-61)."""
-        rows, columns, weight = self.weights(cutoff)
-        made = rows @ (images * self.present) @ columns
-        return np.asarray(made / weight * self.present)
-
-    def smoothed_at(self, x: FloatArray, y: FloatArray, cutoff: float) -> FloatArray:
-        """Return means and effects (1 + e, n) [m] at x, y (n,) [m] after :meth:`smoothed`."""
-        from scipy.ndimage import map_coordinates
-
-        rows, columns, weight = self.weights(cutoff)
-        images = np.concatenate([self.mean[np.newaxis], self.effects]) * self.present
-        made = rows @ images @ columns / weight
-        at = [(y - self.y[0]) / self.steps[1], (x - self.x[0]) / self.steps[0]]
-        return np.array([map_coordinates(m, at, order=1, mode="nearest") for m in made])
+        return self.low_pass(cutoff)(images) * self.present
 
     def weights(self, cutoff: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the weights of rows (r, r) and columns (c, c), and their sum by cell (r, c)."""

@@ -78,27 +78,19 @@ _LEAST_SPREAD = 1e-2
 
 
 def extents_of_parts(
-    maps: Sequence[DeviationMap],
-    disc: Aperture,
-    outline: Aperture | None = None,
-    spacing: float = 0.0,
-) -> list[tuple[UncertainValue, UncertainValue, tuple[float, float]]]:
+    maps: Sequence[DeviationMap], disc: Aperture, gaps: Gaps | None = None
+) -> list[tuple[UncertainValue, UncertainValue]]:
     """Return the peak to valley of maps that differ by smooth form.
 
-    Second is the extent of 99.5 % of the area, of the first map only. Third is the mean square that
-    form between the last track and the rim adds, and its standard uncertainty [m²].
+    Second is the extent of 99.5 % of the area, of the first map only.
 
-    disc: of the smooth terms
-    outline: of the part, None for a map without gaps;  spacing: distance of the tracks [m]
+    disc: of the smooth terms;  gaps: between the points of the maps, None without any
     """
     if not maps[0].noise_known:
         ways = zip(*map(with_and_without, maps), strict=True)
-        one, other = (extents_of_parts(way, disc, outline, spacing) for way in ways)
-        return [
-            (either(a[0], b[0]), either(a[1], b[1]), b[2]) for a, b in zip(one, other, strict=True)
-        ]
+        one, other = (extents_of_parts(way, disc, gaps) for way in ways)
+        return [(either(a[0], b[0]), either(a[1], b[1])) for a, b in zip(one, other, strict=True)]
     form = _PartForm.of(maps[0], disc)
-    gaps = _Gaps.of(maps[0], outline, spacing) if outline else None
     shifts = (map_.deviation - maps[0].deviation for map_ in maps)
     return [form.extents(m, s, gaps, m is maps[0]) for m, s in zip(maps, shifts, strict=True)]
 
@@ -145,16 +137,15 @@ class _PartForm(NamedTuple):
         return cls(value, fit, cell, error, value - mean, local, blurred, waves, unseen)
 
     def extents(
-        self, map_: DeviationMap, shift: FloatArray, gaps: _Gaps | None, robust: bool
-    ) -> tuple[UncertainValue, UncertainValue, tuple[float, float]]:
+        self, map_: DeviationMap, shift: FloatArray, gaps: Gaps | None, robust: bool
+    ) -> tuple[UncertainValue, UncertainValue]:
         """Return the extents of the ``map_`` whose form differs by a smooth ``shift`` (n,) [m]."""
         form = self.value + shift
         even = _equal_areas(map_.area, _MOST_DRAWN)
         order = self.local[np.argsort(form[self.local])]
         some = np.concatenate([even, order[:_HALF], order[-_HALF:]])
         drawn = _drawn(map_.part(some), self, form[some], some)
-        still = np.zeros(2), np.zeros(2), (0.0, 0.0)
-        beyond, alone, more_square = gaps.beyond(self, form) if gaps else still
+        beyond, alone = gaps.beyond(self, form) if gaps else np.zeros((2, 2))
         of_waves = [np.max(way * form + self.texture) - np.max(way * form) for way in (-1, 1)]
         found = []
         many = form[_equal_areas(map_.area, _MOST_FITTED)]
@@ -177,7 +168,7 @@ class _PartForm(NamedTuple):
             between = np.append(np.maximum(beyond, of_waves), -alone) / 2 * (all_ is form)
             value = (figure.value or 0.0) + _extents(all_, ends) - of_some + float(np.sum(between))
             found.append(UncertainValue(float(value), length(figure.uncertainty or 0.0, *between)))
-        return found[0], found[1] if robust else UncertainValue(None, None), more_square
+        return found[0], found[1] if robust else UncertainValue(None, None)
 
 
 def _extents(values: FloatArray, ends: tuple[float, float]) -> FloatArray:
@@ -194,13 +185,13 @@ def _equal_areas(area: FloatArray, most: int) -> IntArray:
     return np.asarray(np.searchsorted(ends, begins, "right"))
 
 
-class _Gaps(NamedTuple):
+class Gaps(NamedTuple):
     """Places that the tracks miss.
 
     x, y: of the points (n,) [m];  spacing: of the tracks [m]
     near: points (q, k), the nearest first;  weights: of their sums that continue the form to a
         place of the rim, and that add to it if the curvature rises (2, q, k)
-    strip: along the rim, for the mean square of the form; None for an annulus or a polygon
+    strip: along the rim, for the mean square of the form; None for an annulus
     share: of the area that half a track along the rim has
     """
 
@@ -213,8 +204,13 @@ class _Gaps(NamedTuple):
     share: float
 
     @classmethod
-    def of(cls, map_: DeviationMap, outline: Aperture, spacing: float) -> _Gaps | None:
-        """Return the gaps between the points and to the ``outline``; None for a profile."""
+    def of(
+        cls, map_: DeviationMap, outline: Aperture, spacing: float, strip: RimStrip | None = None
+    ) -> Gaps | None:
+        """Return the gaps between the points and to the ``outline``; None for a profile.
+
+        strip: along the rim, for sums of piston and other terms, weighted by area
+        """
         from scipy.spatial import cKDTree  # takes long to load
 
         some = np.arange(0, len(map_), -(-len(map_) // _MOST_FITTED))
@@ -228,22 +224,26 @@ class _Gaps(NamedTuple):
         away, near = cKDTree(np.column_stack([x, y])).query(rim.T, _AROUND)
         close = away[:, 0] < _REACH * spacing
         near, rim = near[close], rim[:, close, np.newaxis]
-        places = (x[near] - rim[0]) + 1j * (y[near] - rim[1])
-        parabola, plane = continued(places / spacing)
+        parabola, plane = continued((x[near] - rim[0] + 1j * (y[near] - rim[1])) / spacing)
         weights = np.stack([parabola, (parabola - plane) / 2])
-        every = np.stack([map_.x, map_.y]), map_.area / map_.area.sum(), outline, spacing
-        whole = outline.outline != "annulus"
-        strip = RimStrip.of(*every, lambda x, _: np.ones((1, len(x)))) if whole else None
+        if strip is not None:
+            strip = RimStrip(strip.points, *(v[:1] / map_.area.sum() for v in strip[1:]))
         share = float(way[-1]) * spacing / abs(float(np.sum(u[:-1] * v[1:] - u[1:] * v[:-1])))
         return cls(map_.x, map_.y, spacing, some[near], weights, strip, share)
 
-    def beyond(
-        self, part: _PartForm, form: FloatArray
-    ) -> tuple[FloatArray, FloatArray, tuple[float, float]]:
-        """Return how far the form may reach beyond its extremes, and fall short of them (2,) [m].
+    def square(self, values: FloatArray) -> tuple[float, float]:
+        """Return what form beyond the last track adds to the mean square of ``values`` (n,) [m].
 
-        Third is what the form between the last track and the rim adds to its mean square, and the
-        standard uncertainty of that [m²].
+        Second is the standard uncertainty of that [m²].
+        """
+        if self.strip is not None:
+            more, errors = self.strip.missed(values[self.strip.points] ** 2)
+            return float(more[0]), float(np.linalg.norm(errors))
+        rim, last = np.sum(self.weights[0] * values[self.near], axis=1), values[self.near[:, 0]]
+        return 0.0, self.share * abs(float(np.mean(rim**2 - last**2))) / 2 if len(rim) else 0.0
+
+    def beyond(self, part: _PartForm, form: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return how far the form may reach beyond its extremes, and fall short of them (2,) [m].
 
         form: of the points of the ``part`` (n,) [m]
         """
@@ -257,12 +257,7 @@ class _Gaps(NamedTuple):
             summit = self._summit(values + unseen, sign * part.above + unseen, part.error)
             found.append(max(summit, at_rim) - float(values.max()))
             alone.append(self._alone(values))
-        rises = np.mean(rim**2 - form[self.near[:, 0]] ** 2) if len(rim) else 0.0
-        square = (0.0, self.share * abs(float(rises)) / 2)
-        if self.strip is not None:
-            more, errors = self.strip.missed(form[self.strip.points] ** 2)
-            square = float(more[0]), float(np.linalg.norm(errors))
-        return np.maximum(found, 0.0), np.array(alone), square
+        return np.maximum(found, 0.0), np.array(alone)
 
     def _summit(self, values: FloatArray, above: FloatArray, noise: FloatArray) -> float:
         """Return how high ``values`` (n,) [m] may be between the tracks.
@@ -363,7 +358,7 @@ def _local_features(
     some = np.flatnonzero(chosen[levels[0]])
     if not len(some):
         return some, np.empty(0), some, np.empty(0)
-    cells = [np.unique(level[some], return_inverse=True)[1] for level in levels]
+    cells = [_renumbered(level[some]) for level in levels]
     cells.append(np.arange(len(some)))
     best = _least_risk(cells, rest[some], map_.noise)
     firsts = np.cumsum([0, *(int(cell.max()) + 1 for cell in cells[:-1])])
@@ -384,6 +379,11 @@ def _cells(map_: DeviationMap, shift: float = 0.0) -> list[IntArray]:
     column, row = (place.astype(np.int64) for place in places)
     most, halvings = int(row.max()), reversed(range(_HALVINGS + 1))
     return [(column >> k) * ((most >> k) + 1) + (row >> k) for k in halvings]
+
+
+def _renumbered(cell: IntArray) -> IntArray:
+    """Return the numbers of the cells (n,) without those that have no point."""
+    return np.asarray((np.cumsum(np.bincount(cell) > 0) - 1)[cell])
 
 
 def _texture(map_: DeviationMap, rest: FloatArray) -> FloatArray:
@@ -490,7 +490,7 @@ def _drawn(
         return np.asarray(ways.T @ random.normal(size=(len(ways), _DRAWS)), np.float64)
 
     # Points with the mean of one cell share its noise.
-    _, cell = np.unique(part.cell[points], return_inverse=True)
+    cell = _renumbered(part.cell[points])
     noise = random.normal(size=(int(cell.max()) + 1, _DRAWS))[cell]
     noisy = still + noise * part.error[points, np.newaxis]
     errors = [effects[real_effects(map_)], root_of(part.smooth.covariance) @ terms]

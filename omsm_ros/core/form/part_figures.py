@@ -185,7 +185,11 @@ class SmoothTerms(NamedTuple):
 
 def short_waves(map_: DeviationMap, cells: GridCells, longest: float) -> DeviationMap:
     """Return the points less the waves of their ``cells`` longer than ``longest`` [m]."""
-    low = cells.smoothed_at(map_.x, map_.y, longest)
+    from scipy.ndimage import map_coordinates  # takes long to load
+
+    images = cells.low_pass(longest)(np.concatenate([cells.mean[np.newaxis], cells.effects]))
+    at = [(map_.y - cells.y[0]) / cells.steps[1], (map_.x - cells.x[0]) / cells.steps[0]]
+    low = np.array([map_coordinates(image, at, order=1, mode="nearest") for image in images])
     return replace(map_, deviation=map_.deviation - low[0], effects=map_.effects - low[1:])
 
 

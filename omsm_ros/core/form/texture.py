@@ -86,10 +86,6 @@ def bands_of(
     return Bands(s_filter and shortest, resolved, longest, found)
 
 
-# The figures (f,) of one image.
-_Measure = Callable[[FloatArray], FloatArray]
-
-
 @dataclass(frozen=True, eq=False)
 class _FilteredBand:
     """One band of the cells after each cutoff of the S-filter, to extrapolate to none.
@@ -103,7 +99,7 @@ class _FilteredBand:
     effects: FloatArray
     noise_known: bool
 
-    def figures(self, of: _Measure, sizes: int) -> list[UncertainValue]:
+    def figures(self, of: Callable[[FloatArray], FloatArray], sizes: int) -> list[UncertainValue]:
         """Return figures of the values, without noise and without loss by the S-filter.
 
         Noise adds to the square of a size, so that its own addition is subtracted. The loss of the
@@ -182,18 +178,15 @@ def _of_points(map_: DeviationMap) -> _FilteredBand:
     return _FilteredBand([level[:, even]], map_.effects[:, even], map_.noise_known)
 
 
-# Slopes along x and y (2, 1 + draws + e, r, c) of an image, or its level (1, …), for each cutoff.
-_Planes = list[FloatArray]
-
-
 def _planes(
     cells: GridCells, images: list[FloatArray], cutoffs: list[tuple[float, float]], steep: int = 0
-) -> list[_Planes]:
+) -> list[list[FloatArray]]:
     """Return the slopes of the first ``steep`` images (1 + e, r, c), the levels of the others.
 
-    With those of the noise; of the effects after the first cutoff only.
+    Those along x and y (2, 1 + draws + e, r, c), or levels (1, …), for each cutoff: with those of
+    the noise; of the effects after the first cutoff only.
     """
-    noise, found = _noise(cells), [_Planes() for _ in images]
+    noise, found = _noise(cells), [list[FloatArray]() for _ in images]
     for cutoff in cutoffs:
         fit = cells.planes(cutoff)
         of_noise = fit(noise)
@@ -205,7 +198,7 @@ def _planes(
     return found
 
 
-def _slopes(cells: GridCells, planes: _Planes) -> list[UncertainValue]:
+def _slopes(cells: GridCells, planes: list[FloatArray]) -> list[UncertainValue]:
     """Return the rms and the largest slope [1] of the cells."""
     chosen = cells.present & _neighboured(cells.present)
     if not np.any(chosen):
@@ -238,7 +231,7 @@ def _band(
     cells: GridCells,
     short: float | None,
     long: float | None,
-    planes: _Planes | None = None,
+    planes: list[FloatArray] | None = None,
     *,
     between: bool = False,
 ) -> _FilteredBand:
@@ -257,8 +250,10 @@ def _band(
         own = planes or _planes(cells, [images[:1]], _cutoffs(cells, short))[0]
         levels = [p[0] for p in own]
 
+    low = cells.low_pass(long) if long else lambda images: 0 * images
+
     def kept(images: FloatArray) -> FloatArray:
-        rest = images if long is None else images - cells.smoothed(images, long)
+        rest = images - low(images)
         return cells.between(rest) if between else np.asarray(rest[:, cells.present])
 
     return _FilteredBand([*map(kept, levels)], kept(effects), cells.noise_known)

@@ -7,7 +7,7 @@ the disc to separate the terms, the highest orders are left out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import comb
 from typing import NamedTuple
@@ -111,7 +111,7 @@ def fit_zernikes(
     weights: FloatArray | None = None,
     effects: FloatArray | None = None,
     condition: float = _WORST_CONDITION,
-    rim: tuple[Aperture, float] | None = None,
+    strip: RimStrip | None = None,
     sums: tuple[FloatArray, FloatArray] | None = None,
 ) -> ZernikeFit:
     """Fit ``terms`` to ``deviation`` [m] at x, y [m] of the part, each (n,), by least squares.
@@ -119,8 +119,8 @@ def fit_zernikes(
     weights: area of each point (n,), None for equal weights
     effects: of errors on the deviations (e, n) [m], fitted in the same way
     condition: largest condition number of the terms; with a larger one the highest are left out
-    rim: outline of the part and distance of the tracks [m]; form that no term describes is then
-        continued from the last tracks to the outline, unless that is a polygon
+    strip: along the rim, for sums of the terms; form that no term describes is then continued from
+        the last tracks to the outline
     sums: what :func:`normal_equations` returns for these terms and weights, if it is known
 
     The covariance includes errors that are correlated over a pass of the path. Raises DataError
@@ -151,14 +151,10 @@ def fit_zernikes(
         left_out=tuple(t for t in terms if t not in used),
         effects=found[:, 1:],
     )
-    if rim is None:
-        return fit
-    places, each = np.stack([x, y]), np.ones(len(x)) if weights is None else weights
-    strip = RimStrip.of(places, each, *rim, lambda x, y: zernike_values(*disc.scaled(x, y), used))
     if strip is None:
         return fit
-    rest = deviation[strip.points] - fit.height(*places[:, strip.points])
-    more, errors = (inverse @ each for each in strip.missed(rest))
+    rest = deviation[strip.points] - fit.height(x[strip.points], y[strip.points])
+    more, errors = (inverse @ each[kept] for each in strip.missed(rest))
     covariance = fit.covariance + errors @ errors.T
     return replace(fit, coefficients=fit.coefficients + more, covariance=covariance)
 
@@ -183,9 +179,9 @@ class RimStrip(NamedTuple):
     @classmethod
     def of(
         cls, places: FloatArray, weights: FloatArray, outline: Aperture, spacing: float,
-        columns: Callable[[FloatArray, FloatArray], FloatArray],
+        terms: Sequence[ZernikeIndex], disc: Aperture,
     ) -> RimStrip | None:  # fmt: skip
-        """Return the strip for sums of ``columns`` (k, n); None for a polygon, or few points.
+        """Return the strip for sums of ``terms`` on a ``disc``; None for a polygon or few points.
 
         places: x, y of the points (2, n) [m];  weights: of them (n,);  spacing: of the tracks [m]
         """
@@ -220,17 +216,17 @@ class RimStrip(NamedTuple):
         away = (u[near] - at[0, :, np.newaxis]) + 1j * (v[near] - at[1, :, np.newaxis])
         outwards = np.repeat(rim[0] - 1j * rim[1], _NODES)[:, np.newaxis]
         shares_of = continued(away * outwards / np.abs(outwards) / spacing)
-        nearest = cKDTree((rim + middle).T).query(near_rim.T)[1]
-        own = weights[points] * known[nearest]
+        own = weights[points] * known[cKDTree((rim + middle).T).query(near_rim.T)[1]]
         # The points stand for the covered part of the outline only.
         covered = max(float(np.sum(triangles[known])), 1e-300) * (1 - (1 - 2 * depth) ** 2)
         area = np.outer(triangles * known * np.sum(own) / covered, shares).ravel()
         begins = np.arange(len(area) + 1) * _AROUND
-        sums = columns(*near_rim) * own * _fading((1 - size[points]) / depth)
+        sums, columns = (zernike_values(*disc.scaled(*v), terms) for v in (near_rim, at))
+        sums *= own * _fading((1 - size[points]) / depth)
         parabola, plane = np.zeros((2, *sums.shape))
         for made, share in zip((parabola, plane), shares_of, strict=True):
             each = csr_array((share.ravel(), near.ravel(), begins), (len(area), len(u)))
-            of_means = np.repeat(columns(*at) * area @ each / along, along, axis=1)
+            of_means = np.repeat(columns * area @ each / along, along, axis=1)
             made[:, np.flatnonzero(np.repeat(together, along))] = of_means
         return cls(points, parabola - sums, (parabola - plane) / 2)
 

@@ -81,9 +81,9 @@ class FarPoints:
         self.read += len(good)
         if not len(steps):
             return np.zeros(len(far), bool)
-        table = np.stack([index, points.x, points.y, residual, np.append(steps, steps[-1])])
-        self.rows.append(table[:, far])
-        self.near.append(table[:, ~far & (size > self.limit / 2)])
+        columns = (index, points.x, points.y, residual, np.append(steps, steps[-1]))
+        for kept, at in ((self.rows, far), (self.near, ~far & (size > self.limit / 2))):
+            kept.append(np.stack([values[at] for values in columns]))
         self.points += len(residual)
         self.path += float(np.sum(np.minimum(steps, _JUMP * np.median(steps))))
         self.low = np.minimum(self.low, [points.x.min(), points.y.min()])

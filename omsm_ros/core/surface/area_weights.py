@@ -28,8 +28,10 @@ _LARGEST_ARC, _MOST_STEPS = np.pi / 6, 10.0
 # Sectors of a turn: at least as wide as the largest gap, at most as many as a ring has points for.
 _LEAST_SECTORS, _MOST_SECTORS = round(2 * np.pi / _LARGEST_ARC), 360
 # Most cells along the side of a grid. When their size doubles, the number of occupied cells falls
-# to a quarter if they fill the surface, and to a half along single tracks; the limit between both.
-_MOST_CELLS, _FILLED = 768, 3.5
+# to a quarter if they fill the surface, and to a half along single tracks: limits between both for
+# coarse grids, of which the rim takes this number of cells, and for fine ones, where tracks may be
+# farther apart on a tenth of the surface.
+_MOST_CELLS, _FILLED, _OF_RIM, _FINELY_FILLED = 768, 3.5, 2.5, 3.8
 # Cells along the distance of two evenly spaced points, so that points move by an eighth of it.
 _FINER = 4
 # Largest width of a single line relative to its length.
@@ -150,7 +152,10 @@ def _nearest(x: FloatArray, y: FloatArray, outline: Aperture | None) -> tuple[In
     side = min(_FINER * even, _MOST_CELLS)
     cell, shape = _tiles(x, y, side)
     filled = (np.bincount(cell, minlength=shape[0] * shape[1]) > 0).reshape(shape)
-    while even > 2 and _occupied(x, y, even) < _FILLED * _occupied(x, y, even // 2):
+    while even > 2:
+        least = max(_FILLED, _FINELY_FILLED * (1 - _OF_RIM / even))
+        if _occupied(x, y, even) >= least * _occupied(x, y, even // 2):
+            break
         even //= 2
     reach = side / even
     # Morphological closing (Serra 1982) with a disc: dilation followed by erosion.

@@ -70,10 +70,10 @@ def as_grid(points: MeasuredPoints) -> HeightGrid | None:
     if min(shape) < 2 or shape[0] * shape[1] * _LEAST_FILLED > len(points):
         return None
     cell = row * shape[1] + column
-    if len(np.unique(cell)) != len(cell):
-        return None
     height = np.full(shape[0] * shape[1], np.nan)
     height[cell] = points.height
+    if np.count_nonzero(np.isfinite(height)) != len(cell):  # several points at one place
+        return None
     return HeightGrid(height=height.reshape(shape), x0=x0, y0=y0, dx=dx, dy=dy)
 
 

@@ -93,8 +93,9 @@ def without_duplicates(points: MeasuredPoints) -> MeasuredPoints:
     for values in (points.x, points.y, points.height):
         number = (number ^ values.view(np.uint64)) * _MIXED
         number ^= number >> np.uint64(32)
-    _, first = np.unique(number, return_index=True)
-    if len(first) == len(points):
+    ordered = np.sort(number)
+    if np.all(ordered[1:] != ordered[:-1]):
         return points
+    _, first = np.unique(number, return_index=True)
     note = str(Notice("surface.duplicates", points=len(points) - len(first)))
     return replace(points.part(np.sort(first)), notes=(*points.notes, note))

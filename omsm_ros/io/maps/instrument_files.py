@@ -401,7 +401,7 @@ def read_x3p(path: Path, channel: str | None = None) -> MeasuredPoints:
         chosen = chosen_channel(names, channel, 0, what)
         place = _places(x3pio, content, chosen)
     notes = (channel_note(names, chosen),) if len(names) > 1 else ()
-    return measured(place[:, 0], place[:, 1], place[:, 2], notes=notes)
+    return measured(place[0], place[1], place[2], notes=notes)
 
 
 def _with_known_revision(archive: zipfile.ZipFile) -> io.BytesIO | None:
@@ -434,13 +434,13 @@ def _with_known_revision(archive: zipfile.ZipFile) -> io.BytesIO | None:
 
 
 def _places(x3pio: Any, content: Any, chosen: int = 0) -> FloatArray:
-    """Return x, y, height (n, 3) [m] of one layer; NaN = missing."""
+    """Return x, y, height (3, n) [m] of one layer; NaN = missing."""
     layer, header = content.layers[chosen], content.header
     # A missing increment reads as 1: steps of a metre, which no instrument has.
     if header.z.data_type.value in _WHOLE and header.z.increment == 1.0:
         raise ValueError("its heights are whole numbers without an increment; save it with one")
     if isinstance(content, x3pio.PointCloud):
-        places = np.asarray(layer.points(), np.float64)
+        places = np.asarray(layer.points(), np.float64).T
     elif not header.x.is_incremental or (np.ndim(layer.z) == 2 and not header.y.is_incremental):
         raise ValueError("its places are not evenly spaced; save it with even spacings")
     else:
@@ -449,10 +449,10 @@ def _places(x3pio: Any, content: Any, chosen: int = 0) -> FloatArray:
         dy = header.y.increment if np.ndim(layer.z) == 2 else dx
         grid = HeightGrid(height=height, x0=0.0, y0=0.0, dx=dx, dy=dy)
         x, y = np.meshgrid(grid.x, grid.y)
-        places = np.column_stack([x.ravel(), y.ravel(), height.ravel()])
+        places = np.stack([x.ravel(), y.ravel(), height.ravel()])
     if content.placement is None:
         return places
-    return np.asarray(content.placement.apply(places), np.float64)
+    return np.asarray(content.placement.apply(places.T), np.float64).T
 
 
 def write_x3p(path: Path, grid: HeightGrid, comment: str) -> None:

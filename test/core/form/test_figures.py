@@ -44,7 +44,7 @@ def measured(true, noise, effects, seed):
 
 
 def figures(map_):
-    whole, robust = extents_of_parts([map_], DISC)[0][:2]
+    whole, robust = extents_of_parts([map_], DISC)[0]
     return {"pv": whole, "robust": robust, "rms": rms_of_part(map_)}
 
 

@@ -4,13 +4,24 @@ import numpy as np
 import pytest
 from soaked import always
 
+from omsm_ros.core.form.analyse import ZERNIKES, optical_terms
 from omsm_ros.core.form.deviation_map import DeviationMap
-from omsm_ros.core.form.part_extents import extents_of_parts
-from omsm_ros.core.form.part_figures import rms_of_part
+from omsm_ros.core.form.part_extents import Gaps, extents_of_parts
+from omsm_ros.core.form.part_figures import SmoothTerms, rms_of_part
+from omsm_ros.core.form.zernike_fit import RimStrip, fit_zernikes
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.area_weights import area_weights
 
 R, NOISE = 12.7e-3, 10e-9
+
+
+def gaps_of(map_, outline, spacing):
+    """Return the gaps of the map with the strip along its rim."""
+    places = np.stack([map_.x, map_.y])
+    strip = RimStrip.of(places, map_.area, outline, spacing, ZERNIKES[:1], outline.disc)
+    return Gaps.of(map_, outline, spacing, strip)
+
+
 X, Y = (v.ravel() for v in np.meshgrid(*[np.linspace(-R, R, 200)] * 2))
 INSIDE = np.hypot(X, Y) <= R
 X, Y = X[INSIDE], Y[INSIDE]
@@ -31,7 +42,7 @@ def test_the_whole_peak_to_valley_contains_local_defects(name):
         noise = np.random.default_rng(seed).normal(0, NOISE, len(X))
         map_ = DeviationMap(x=X, y=Y, deviation=form + noise, area=np.ones(len(X)),
                             effects=np.empty((0, len(X))), noise=NOISE)  # fmt: skip
-        whole, _ = extents_of_parts([map_], Aperture(R))[0][:2]
+        whole, _ = extents_of_parts([map_], Aperture(R))[0]
         held += abs(whole.value - np.ptp(form)) <= 2 * whole.uncertainty
         assert whole.value + 2 * whole.uncertainty > 0.9 * np.ptp(form)
         assert whole.value > 0.8 * np.ptp(form)
@@ -77,12 +88,19 @@ def test_a_rolled_edge_beyond_the_last_whole_turn_belongs_to_the_figures(turns):
         map_ = DeviationMap(x=x, y=y, deviation=rolled(R * share) + noise, noise=2e-9,
                             area=area_weights(x, y, outline=outline),
                             effects=np.empty((0, len(x))))  # fmt: skip
-        [(whole, _, rim)] = extents_of_parts([map_], outline, outline, spacing)
-        rms = rms_of_part(map_, rim)
+        gaps = gaps_of(map_, outline, spacing)
+        whole = extents_of_parts([map_], outline, gaps)[0][0]
+        rms = rms_of_part(map_, gaps.square(map_.deviation))
         assert abs(whole.value - 500e-9) <= 2 * whole.uncertainty
         assert whole.uncertainty < 30e-9
         assert abs(rms.value - true) <= 2 * rms.uncertainty
         assert rms.uncertainty < 0.016 * true
+        # The total rms of a drawing is without piston, 500 nm (0.2) ∫ s² (0.9 + 0.1 s) ds.
+        fit = fit_zernikes(x, y, map_.deviation, ZERNIKES, outline, weights=map_.area)
+        total = optical_terms(SmoothTerms.of(map_, outline, ZERNIKES), fit, gaps)["iso10110_RMSt"]
+        known = np.sqrt(true**2 - (500e-9 * 0.2 * (0.3 + 0.025)) ** 2)
+        assert abs(total.value - known) <= 2 * total.uncertainty
+        assert total.uncertainty < 0.018 * known
 
 
 def test_an_edge_that_flattens_towards_the_rim_is_continued_to_it():
@@ -99,7 +117,7 @@ def test_an_edge_that_flattens_towards_the_rim_is_continued_to_it():
         map_ = DeviationMap(x=x, y=y, deviation=form(share, turn) + noise, noise=0.5e-9,
                             area=area_weights(x, y, outline=outline),
                             effects=np.empty((0, len(x))))  # fmt: skip
-        whole = extents_of_parts([map_], outline, outline, R / turns)[0][0]
+        whole = extents_of_parts([map_], outline, gaps_of(map_, outline, R / turns))[0][0]
         true = np.ptp(form(*np.meshgrid(np.linspace(0, 1, 400), np.linspace(0, 2 * np.pi, 400))))
         assert abs(whole.value - true) < 2 * whole.uncertainty < 12e-9
 
@@ -119,7 +137,7 @@ def test_the_rms_is_of_the_covered_part_of_the_rim(missing):
     map_ = DeviationMap(x=x[there], y=y[there], deviation=form[there], noise=0.0,
                         area=area_weights(x[there], y[there], outline=outline),
                         effects=np.empty((0, int(np.sum(there)))))  # fmt: skip
-    [(_, _, rim)] = extents_of_parts([map_], outline, outline, R / 60)
+    rim = gaps_of(map_, outline, R / 60).square(map_.deviation)
     assert rms_of_part(map_, rim).value == pytest.approx(100e-9 / 6**0.5, rel=5e-3)
 
 
@@ -136,7 +154,7 @@ def test_a_rolled_edge_on_a_dense_map_is_no_higher_than_it_is():
     for _ in range(3):
         map_ = DeviationMap(x=x, y=y, deviation=form + random.normal(0, 3e-9, len(x)), noise=3e-9,
                             area=np.ones(len(x)), effects=np.empty((0, len(x))))  # fmt: skip
-        whole = extents_of_parts([map_], disc, disc, line[1] - line[0])[0][0]
+        whole = extents_of_parts([map_], disc, gaps_of(map_, disc, line[1] - line[0]))[0][0]
         # From the flank of the saddle within the fall to its other side at the rim.
         off.append((whole.value - 205.3e-9) / whole.uncertainty)
         assert whole.uncertainty < 3e-9
@@ -159,7 +177,7 @@ def test_a_summit_between_two_tracks_belongs_to_the_figure(along, off, bow):
     map_ = DeviationMap(x=x, y=y, noise=1e-9, area=np.ones(len(x)), effects=np.empty((0, len(x))),
                         deviation=height * np.exp(-away) + bow * (x / R) ** 2 + noise)  # fmt: skip
     square = Aperture(1.5 * R, outline="rectangle", sizes=(R, R))
-    whole = extents_of_parts([map_], Aperture(1.5 * R), square, pitch)[0][0]
+    whole = extents_of_parts([map_], Aperture(1.5 * R), gaps_of(map_, square, pitch))[0][0]
     assert abs(whole.value - height) <= 2 * whole.uncertainty
     assert whole.uncertainty < 0.25 * height
 
@@ -179,7 +197,7 @@ def test_a_pip_that_the_cells_divide_belongs_to_the_figure(seed):
     map_ = DeviationMap(x=x, y=y, deviation=form + noise, area=np.ones(len(x)),
                         effects=np.empty((0, len(x))), noise=NOISE)  # fmt: skip
     square = Aperture.of("rectangle", R, R)
-    whole = extents_of_parts([map_], Aperture(1.5 * R), square, step)[0][0]
+    whole = extents_of_parts([map_], Aperture(1.5 * R), gaps_of(map_, square, step))[0][0]
     truth = 60e-9 + 20e-9
     assert abs(whole.value - truth) <= 2 * whole.uncertainty
     assert whole.uncertainty < 0.3 * truth
@@ -199,7 +217,7 @@ def test_the_peak_to_valley_of_fine_rings_is_not_stated_too_high():
         map_ = DeviationMap(x=x, y=y, deviation=form + rng.normal(0, 2e-9, len(x)),
                             area=np.ones(len(x)), effects=np.empty((0, len(x))),
                             noise=2e-9)  # fmt: skip
-        whole = extents_of_parts([map_], Aperture(R), Aperture(R), R / turns)[0][0]
+        whole = extents_of_parts([map_], Aperture(R), gaps_of(map_, Aperture(R), R / turns))[0][0]
         score.append((whole.value - np.ptp(form)) / whole.uncertainty)
     assert np.mean(score) < 1.3
     assert np.sum(np.abs(score) <= 2) >= 7
@@ -220,7 +238,7 @@ def test_the_apex_of_a_cone_between_the_points_belongs_to_the_figure(off):
     map_ = DeviationMap(x=x, y=y, noise=1e-9, area=np.ones(len(x)), deviation=form + noise,
                         effects=np.empty((0, len(x))))  # fmt: skip
     square = Aperture.of("rectangle", R, R)
-    whole = extents_of_parts([map_], Aperture(1.5 * R), square, pitch)[0][0]
+    whole = extents_of_parts([map_], Aperture(1.5 * R), gaps_of(map_, square, pitch))[0][0]
     assert abs(whole.value - height) <= 2 * whole.uncertainty
     assert whole.uncertainty < 0.12 * height
 
@@ -245,6 +263,6 @@ def test_undetected_terms_belong_to_the_uncertainty_at_a_corner():
         map_ = DeviationMap(x=x, y=y, deviation=deviation, noise=4e-9,
                             area=area_weights(x, y, outline=outline),
                             effects=np.empty((0, len(x))))  # fmt: skip
-        whole = extents_of_parts([map_], outline, outline, R / 60)[0][0]
+        whole = extents_of_parts([map_], outline, gaps_of(map_, outline, R / 60))[0][0]
         off.append((whole.value - np.ptp(form(*everywhere))) / whole.uncertainty)
     assert np.sqrt(np.mean(np.square(off))) < 1.4

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from soaked import always
 
-from omsm_ros.core.form.zernike_fit import fit_zernikes
+from omsm_ros.core.form.zernike_fit import RimStrip, fit_zernikes
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.zernike_terms import (
@@ -175,8 +175,8 @@ def test_form_is_continued_from_the_last_tracks_to_the_outline(outline, sizes):
     points = np.array(raster(150, 450))
     points = points[:, rim.holds(*points)]
     area = area_weights(*points, outline=rim)
-    for known in (None, (rim, DISC.radius / 75)):
-        fit = fit_zernikes(*points, waves(*points), TERMS, DISC, weights=area, rim=known)
+    for known in (None, RimStrip.of(points, area, rim, DISC.radius / 75, TERMS, DISC)):
+        fit = fit_zernikes(*points, waves(*points), TERMS, DISC, weights=area, strip=known)
         off.append(fit.coefficients - true.coefficients)
     rms = np.sqrt(np.mean(np.square(off), axis=1))
     assert rms[1] < rms[0] / 2
@@ -186,6 +186,7 @@ def test_terms_of_parts_with_rings_hold_the_truth():
     """Rings of 10 nm on spirals, with noise of 1 nm; without the rim 80 % of the terms do."""
     x, y, area = spiral(80, 40_000)
     rng, held = np.random.default_rng(8), []
+    strip = RimStrip.of(np.stack([x, y]), area, DISC, DISC.radius / 80, TERMS, DISC)
     far, weight = np.polynomial.legendre.leggauss(400)
     far, weight = (far + 1) / 2, weight * (far + 1)
     along = zernike_values(far, np.zeros_like(far), TERMS)
@@ -193,7 +194,7 @@ def test_terms_of_parts_with_rings_hold_the_truth():
         rng.uniform(6, 15, 8) * DISC.radius / 80, rng.uniform(0, 6, 8), strict=True
     ):
         value = rings(x, y, pitch, phase) / 4 + rng.normal(0, 1e-9, len(x))
-        fit = fit_zernikes(x, y, value, TERMS, DISC, weights=area, rim=(DISC, DISC.radius / 80))
+        fit = fit_zernikes(x, y, value, TERMS, DISC, weights=area, strip=strip)
         form = rings(far * DISC.radius + DISC.x, DISC.y, pitch, phase) / 4
         true = [
             (along[k] @ (weight * form)) / (along[k] ** 2 @ weight) if t.m == 0 else 0.0
@@ -249,8 +250,9 @@ def test_terms_of_a_rolled_edge_hold_where_points_are_sparse_along_the_turns():
 
     disc, share = Aperture(25e-3), np.linspace(1, 0, 12_000)
     x, y = (disc.radius * share * f(280 * np.pi * share) for f in (np.cos, np.sin))
-    area, rim = area_weights(x, y, outline=disc), (disc, disc.radius / 140)
-    found = fit_zernikes(x, y, rolled(share), TERMS, disc, weights=area, rim=rim)
+    area = area_weights(x, y, outline=disc)
+    strip = RimStrip.of(np.stack([x, y]), area, disc, disc.radius / 140, TERMS, disc)
+    found = fit_zernikes(x, y, rolled(share), TERMS, disc, weights=area, strip=strip)
     far = np.sqrt((np.arange(800) + 0.5) / 800)
     angle = 2 * np.pi * np.arange(64)[:, np.newaxis] / 64
     u, v = (disc.radius * (far * f(angle)).ravel() for f in (np.cos, np.sin))

@@ -54,6 +54,13 @@ def test_a_turning_scan_weighs_the_disc_as_it_is(path, form, rms) -> None:
     assert np.average((value - mean) ** 2, weights=weights) == pytest.approx(rms**2, rel=4e-3)
 
 
+def test_within_its_outline_a_disc_is_weighed_as_it_is_where_turns_are_farther_apart() -> None:
+    x, y = (v / RADIUS for v in feed_that_changes())
+    weights = area_weights(RADIUS * x, RADIUS * y, outline=Aperture(RADIUS))
+    assert np.average((x**2 - y**2) ** 2, weights=weights) == pytest.approx(1 / 6, rel=0.01)
+    assert np.average(x**2, weights=weights) == pytest.approx(1 / 4, rel=0.01)
+
+
 def slower_on_one_side() -> Path:
     """The spindle lingers where x is positive, three times as long as opposite."""
     share = np.arange(100_000) / 100_000
@@ -68,10 +75,11 @@ def lost_on_one_side() -> Path:
     return x[kept], y[kept]
 
 
+@pytest.mark.parametrize("outline", [None, Aperture(RADIUS)])
 @pytest.mark.parametrize("path", [slower_on_one_side, lost_on_one_side])
-def test_within_a_turn_each_part_of_it_counts_by_its_area(path) -> None:
+def test_within_a_turn_each_part_of_it_counts_by_its_area(path, outline) -> None:
     x, y = path()
-    weights = area_weights(x, y)
+    weights = area_weights(x, y, outline=outline)
     assert abs(np.mean(x)) > 0.04 * RADIUS
     assert abs(np.average(x, weights=weights)) < 0.01 * RADIUS
     assert np.average(x**2, weights=weights) == pytest.approx(RADIUS**2 / 4, rel=0.01)
