@@ -17,7 +17,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from omsm_ros.instruments.emulator_factory import EMULATED, emulated
-from omsm_ros.io.folders import runtime_folder
+from omsm_ros.io.files import runtime_folder
 from omsm_ros.nodes.start import LAUNCHED_BY
 
 Parameters = dict[str, object]

@@ -6,7 +6,7 @@ from contextlib import contextmanager, suppress
 import pytest
 
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.io.folders import exclusive_lock, runtime_folder
+from omsm_ros.io.files import exclusive_lock, runtime_folder
 
 
 @contextmanager

@@ -25,11 +25,11 @@ from omsm_ros.io.files import (
     exception_text,
     explained_errors,
     load_object,
+    locked_folder,
     make_folder,
     save_json,
     save_text,
 )
-from omsm_ros.io.folders import locked_folder
 from omsm_ros.io.json_and_yaml import TEXT, group, or_none, ranged
 from omsm_ros.io.results import read_summary
 from omsm_ros.pipelines.history import recorded_ns_of

@@ -1,4 +1,4 @@
-"""Commands for a scan: predict, correct, align, report."""
+"""Commands for a scan: predict, correct, report."""
 
 import argparse
 from argparse import SUPPRESS
@@ -28,16 +28,15 @@ from omsm_ros.io.descriptions import (
     load_pitch,
     load_sources,
     load_surface,
-    save_geometry,
 )
-from omsm_ros.io.folders import MEASUREMENT_FILES, result_folder
+from omsm_ros.io.files import MEASUREMENT_FILES, result_folder
 from omsm_ros.messages import rows_from, text_from
 from omsm_ros.pipelines.correct import Admission, StampJoining
 from omsm_ros.pipelines.history import keep_measurement, record_in_catalogue
 from omsm_ros.pipelines.measure import measure
 from omsm_ros.pipelines.recording import scan_path_of
-from omsm_ros.quantities import BUDGET, EXPOSURE, LAG, RADIUS, STAMP_DELAY, UNCERTAINTY
-from omsm_ros.readable import measured, plain, quantity, rounded_down
+from omsm_ros.quantities import BUDGET, EXPOSURE, LAG, STAMP_DELAY, UNCERTAINTY
+from omsm_ros.readable import plain, rounded_down
 from omsm_ros.report.verdict import headline, next_steps
 
 
@@ -188,62 +187,6 @@ def _times(factor: float) -> str:
     return f"{'≥ ' if factor >= FASTEST else ''}{plain(rounded_down(factor))} ×"
 
 
-_NO_SPHERE = (
-    "the residual is several times the noise: the surface is not a sphere of that radius, or its "
-    "form error or the probe's error on slopes is as large; the centre may be worse than stated"
-)
-# Beyond this ratio of residual to scatter, nine tenths of the mean square are not noise.
-_RESIDUAL_RATIO = 3.0
-
-
-def _declare_align(add: Arguments) -> None:
-    add.bags("bag", help="a scan of a reference sphere")
-    add("--calibration", "CAL.json", required=True)
-    add("--radius", RADIUS, "radius of the sphere [m], negative if convex", required=True)
-    add("--geometry", "GEOMETRY.yaml", "known values to start from")
-    add("--out", "GEOMETRY.yaml", required=True)
-
-
-def _align(args: argparse.Namespace) -> Facts:
-    # Imported on demand, because the other commands here do not need it.
-    from omsm_ros.pipelines.study_scans import alignment_of
-
-    calibration = load_calibration(args.calibration)
-    known = load_geometry(args.geometry)
-    found, account = alignment_of(cell_of(args.bag, args), calibration, args.radius, known)
-    save_geometry(args.out, found.geometry)
-    names = ("centre_x", "centre_y", "beam_x", "beam_y")
-    # JSON has no infinity, so the uncertainty of an unidentifiable beam direction is null.
-    spread = found.uncertainty if found.beam_found else (*found.uncertainty[:2], None, None)
-    return {
-        "geometry": asdict(found.geometry),
-        "uncertainty": dict(zip(names, spread, strict=True)),
-        "residual": found.residual,
-        "scatter": found.scatter,
-        "warnings": [_NO_SPHERE] * (found.residual > _RESIDUAL_RATIO * found.scatter),
-        "beam_found": found.beam_found,
-        "used": found.used,
-        "samples": account.as_dict(),
-        "file": str(args.out),
-    }
-
-
-def _show_align(facts: Facts) -> Rows:
-    rows = []
-    for name, spread in facts["uncertainty"].items():
-        value, length = facts["geometry"][name], name.startswith("centre")
-        stated = measured(value, spread, "m" if length else "rad")
-        rows.append(
-            (name, stated if spread is not None else f"{stated}, not identifiable in this scan")
-        )
-    residual, scatter = (quantity(facts[name], "m") for name in ("residual", "scatter"))
-    rows.append(("residual", f"{residual} rms, of which {scatter} noise"))
-    rows += [("warning", warning) for warning in facts["warnings"]]
-    corrected = facts["samples"]["axes"]["corrected"]
-    rows.append(("points", f"{corrected} corrected, {facts['used']} of them fitted"))
-    return [*rows, written([facts["file"]])]
-
-
 def _declare_report(add: Arguments) -> None:
     add("result", "DIR", "result folder of 'omsm correct'")
     add("--calibration", "CAL.json", required=True)
@@ -262,6 +205,5 @@ def _report(args: argparse.Namespace) -> Facts:
 COMMANDS = (
     CliCommand("predict", _declare_predict, _predict, _show_predict),
     CliCommand("correct", _declare_correct, _correct, _show_correct),
-    CliCommand("align", _declare_align, _align, _show_align),
     CliCommand("report", _declare_report, _report, lambda facts: [written([facts["report"]])]),
 )

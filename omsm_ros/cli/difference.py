@@ -9,8 +9,7 @@ from omsm_ros.core.comparison.matching import MATCHING_PARAMETERS, SEATED, order
 from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.descriptions import load_surface
-from omsm_ros.io.files import DIFFERENCE, REPORT
-from omsm_ros.io.folders import result_folder
+from omsm_ros.io.files import DIFFERENCE, REPORT, result_folder
 from omsm_ros.messages import text_from
 from omsm_ros.pipelines.difference import (
     MAP,

@@ -31,8 +31,18 @@ from omsm_ros.core.surface.height_grid import gradient_of
 from omsm_ros.errors import ConfigurationError, DataError, FileError
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_limits, load_surface
-from omsm_ros.io.files import CURVES, DEVIATION, FORM, REPORT, atomic_file, save_bytes, save_text
-from omsm_ros.io.folders import FORM_FILES, MEASUREMENT_FILES, result_folder
+from omsm_ros.io.files import (
+    CURVES,
+    DEVIATION,
+    FORM,
+    FORM_FILES,
+    MEASUREMENT_FILES,
+    REPORT,
+    atomic_file,
+    result_folder,
+    save_bytes,
+    save_text,
+)
 from omsm_ros.io.gcode_file import path_gcode as program_of
 from omsm_ros.messages import text_from
 from omsm_ros.pipelines.form import judge_form, open_measurement

@@ -39,8 +39,7 @@ from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.descriptions import load_multisine
-from omsm_ros.io.files import atomic_file, save_text
-from omsm_ros.io.folders import result_folder
+from omsm_ros.io.files import atomic_file, result_folder, save_text
 from omsm_ros.pipelines.history import keep_calibration, record_in_catalogue
 from omsm_ros.pipelines.identify import load_model, record_of_table, save_model, write_certificate
 from omsm_ros.pipelines.recording import Recording, scan_path_of

@@ -71,9 +71,9 @@ _MODULES = {
     "start": ("twin", "completion"),
     "recordings": ("record", "inspect", "import"),
     "calibration": ("verify", "compare", "calset"),
-    "latency": ("selfcal", "reversal"),
+    "adjust": ("selfcal", "reversal", "latency", "align", "sources"),
     "form": ("surface", "compensate"),
-    "correct": ("predict", "align", "report"),
+    "correct": ("predict", "report"),
     "campaign": ("batch",),
     "identify": ("validate",),
 }

@@ -21,9 +21,9 @@ from omsm_ros.io.files import (
     atomic_file,
     explained_errors,
     open_regular,
+    read_result,
     save_bytes,
 )
-from omsm_ros.io.folders import read_result
 from omsm_ros.io.json_and_yaml import (
     CONFORMITY,
     FIGURE,

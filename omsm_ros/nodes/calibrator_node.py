@@ -27,8 +27,7 @@ from omsm_ros.io import message_mapping
 from omsm_ros.io.calibration_file import CalibrationFolder
 from omsm_ros.io.child_process import UNLIMITED, in_child
 from omsm_ros.io.figure_messages import certificate_message
-from omsm_ros.io.files import resolved_within
-from omsm_ros.io.folders import exclusive_lock
+from omsm_ros.io.files import exclusive_lock, resolved_within
 from omsm_ros.nodes.background_worker import BackgroundWorker, Goal, serve_action, silent
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import BAG_FOLDERS, TRIGGER, trigger_of

@@ -23,7 +23,7 @@ from omsm_ros.instruments.emulator_factory import (
 )
 from omsm_ros.io import message_mapping
 from omsm_ros.io.descriptions import load_disturbances
-from omsm_ros.io.folders import exclusive_lock, runtime_folder
+from omsm_ros.io.files import exclusive_lock, runtime_folder
 from omsm_ros.nodes.background_worker import Cancelled, Goal, serve_action
 from omsm_ros.nodes.diagnostics import StateReport
 from omsm_ros.nodes.managed import ManagedNode

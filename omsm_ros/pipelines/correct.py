@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -10,21 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.adjustment.scan_data import SPOT_M, ScanData
+from omsm_ros.core.adjustment.scan_data import SPOT_M
 from omsm_ros.core.calibration.applicability import admit, objections
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.source_kinds import standard_fields
 from omsm_ros.core.correction.surface_points import SurfacePoints
-from omsm_ros.core.correction.systematic import (
-    MOST_TRACED,
-    ScanTrace,
-    resolves_per_turn_waves,
-    scan_fields,
-)
+from omsm_ros.core.correction.systematic import MOST_TRACED, resolves_per_turn_waves, scan_fields
 from omsm_ros.core.correction.uncertainty import with_lateral_uncertainty
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.kinematics.scan_path import ScanPath, ScanPathReader
+from omsm_ros.core.kinematics.scan_path import ScanPathReader
 from omsm_ros.core.streams.axes_at_probe import axes_at_probe
 from omsm_ros.core.streams.blocks import (
     Account,
@@ -35,7 +30,7 @@ from omsm_ros.core.streams.blocks import (
 )
 from omsm_ros.core.streams.statistics import EvenSelection
 from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
-from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, deviation
+from omsm_ros.core.surface.deviation import RunningStatistics, deviation
 from omsm_ros.errors import BagError, ConfigurationError, DataError, Notice
 from omsm_ros.io.results import MOST_DRAWN, PlyWriter, with_added_variance
 from omsm_ros.io.topics import AnyBag
@@ -196,78 +191,160 @@ def _joined_by_stamps(blocks: Iterator[Any], how: StampJoining) -> Iterator[Any]
 _MOST_ADJUSTED = 1_000_000
 
 
-@dataclass(frozen=True, eq=False)
-class Correction:
-    """Result of the correction of one bag.
+class Correction(CorrectedScan):
+    """A bag that is corrected in one pass, and what its samples and points show.
 
-    account: of every sample, by stream;  budget: rms of each source of uncertainty [m]
-    stamp_skew: difference of the streams' stamps for one trigger [s], None without a pair
-    admission, reasons: how the calibration was admitted, and its mismatches with the scan
+    nominal: surface for the deviations, or None;  lateral: standard uncertainty of x and y [m]
+
+    After :meth:`write`:
+
+    budget: rms of each source of uncertainty [m]
     statistics: of the dynamic "error", and with a nominal surface of the "raw" and "corrected"
         deviation, over all points; empty without points
     largest_uncertainty: of a point [m];  points: evenly chosen rows of the cloud
-    trace: points that represent the scan in the evaluation of its systematic errors
     path: start of the scan path, None without axes
-    recorded_ns: when the recording began [ns, ROS time], None if unknown
-    temperatures: as recorded (n,) [°C], in their order; NaN: implausible
-    sample_period: [s];  faults: findings from counters and stamps of the recording
+    faults: findings from counters and stamps of the recording
     scan: for its adjustment; None if it is too long, too short, or its counter began anew
     """
 
-    account: dict[str, Any]
-    budget: dict[str, float]
-    stamp_skew: float | None
-    admission: dict[str, object]
-    reasons: tuple[Notice, ...]
-    statistics: dict[str, FormStatistics]
-    largest_uncertainty: float
-    points: NDArray[np.void]
-    trace: ScanTrace
-    path: ScanPath | None
-    sample_period: float
-    recorded_ns: int | None
-    temperatures: FloatArray
-    faults: tuple[str, ...] = ()
-    scan: ScanData | None = None
+    def __init__(
+        self, recording: Recording, calibration: Calibration, options: CorrectionOptions,
+        admission: Admission, by_stamps: StampJoining | None, nominal: Surface | None,
+        lateral: float,
+    ) -> None:  # fmt: skip
+        super().__init__(recording, calibration, options, admission=admission, by_stamps=by_stamps)
+        self._nominal, self._lateral, self._by_counter = nominal, lateral, by_stamps is None
+        self._axes, self._distance = StreamWatch(), StreamWatch()
+        self._z = (np.inf, -np.inf)
+        names = ("error",) if nominal is None else ("error", "raw", "corrected")
+        self._running = {name: RunningStatistics() for name in names}
+        self.largest_uncertainty = 0.0
+        self._drawn, self._path = EvenSelection(MOST_DRAWN), ScanPathReader(MAX_PATH_SAMPLES)
+        self._blocks: list[AxisBlock] = []
+        self._points: list[SurfacePoints] = []
+        self._kept = 0
+
+    def write(self, ply: PlyWriter) -> None:
+        """Correct the whole bag into ``ply``; BagError as :meth:`steps`."""
+        for block, points in self.steps():
+            if block is not None:
+                self._see(block)
+            if points is not None:
+                if self._nominal is not None and self._lateral:
+                    points = with_lateral_uncertainty(points, self._nominal, self._lateral)
+                self._add(points, ply.write(points))
+        self.budget, self.path = self.corrector.budget, self._path.path()
+        self.points = self._drawn.rows()
+        running = self._running.items() if len(self._drawn) else ()
+        self.statistics = {name: one.statistics() for name, one in running}
+        self.faults, self.scan = self._faults(), None
+        with suppress(DataError):  # points that make no scan
+            if self._points:
+                self.scan = scan_data(self._blocks, self._points, self.sample_period)[0]
+
+    def _see(self, block: AxisBlock | DistanceBlock) -> None:
+        self._path.add(block)
+        if isinstance(block, AxisBlock) and np.any(here := np.isfinite(block.z)):
+            low, high = self._z
+            self._z = (min(low, block.z[here].min()), max(high, block.z[here].max()))
+        if isinstance(block, AxisBlock) and self._kept <= _MOST_ADJUSTED:
+            self._blocks.append(block)
+        (self._axes if isinstance(block, AxisBlock) else self._distance).add(block)
+
+    def _add(self, points: SurfacePoints, packed: NDArray[np.void]) -> None:
+        self._drawn.add(packed)
+        if not len(points):
+            return
+        largest = float(points.uncertainty.max())
+        self.largest_uncertainty = max(self.largest_uncertainty, largest)
+        self._kept += len(points)
+        if self._kept <= _MOST_ADJUSTED:
+            self._points.append(points)
+        else:
+            self._points, self._blocks = [], []
+        x, y, error = points.x, points.y, points.dynamic_error
+        self._running["error"].add(x, y, error)
+        if self._nominal is not None:
+            corrected = deviation(x, y, points.height, self._nominal)
+            self._running["corrected"].add(x, y, corrected)
+            self._running["raw"].add(x, y, corrected + error)
+
+    def _faults(self) -> tuple[str, ...]:
+        """Return findings from counters and stamps; none of axes that are joined by stamps.
+
+        The first is that all points lie on one spot, as those of a step test; the last, that Z left
+        the range in which its pitch was measured.
+        """
+        found: list[Notice | str] = [*self._distance.faults("distance")]
+        if self._by_counter:
+            skew = counter_skew(self._axes, self._distance)
+            found = [*self._axes.faults("axes"), *found]
+            lapse = self.time_lapse
+            found += [*self._axes.period_fault("axes", lapse)]
+            found += [*self._distance.period_fault("distance", lapse)]
+            stated = self.options.sources
+            resolution = stated.encoder_resolution if stated else 0.0
+            found += self._axes.step_faults(resolution, self._lateral)
+            samples = self.account.distance.counted.get("slipped", 0)
+            if samples:
+                found.append(
+                    f"{samples} samples were not corrected: {self.corrector.pairing.watch.found}"
+                )
+            else:
+                found += skew_fault(skew, self.sample_period, self.options.trigger)
+        rows, pitch, (low, high) = self.points, self.options.pitch, self._z
+        if len(rows) and max(np.ptp(rows["x"]), np.ptp(rows["y"])) < SPOT_M:
+            found.insert(
+                0,
+                f"all points lie within {quantity(SPOT_M, 'm')}: X and C did not scan a surface; "
+                "evaluate a step test with 'omsm identify', and test a calibration on one with "
+                "'omsm verify'",
+            )
+        if pitch is not None and (low < pitch.position[0] or pitch.position[-1] < high):
+            first, last = pitch.position[0], pitch.position[-1]
+            found.append(
+                f"Z goes from {quantity(low, 'm')} to {quantity(high, 'm')}, but its pitch was "
+                f"measured from {quantity(first, 'm')} to {quantity(last, 'm')} and taken as "
+                "constant beyond; measure it over the whole range of Z"
+            )
+        return tuple(map(str, found))
 
 
-def with_lateral_errors(
-    done: Correction, cloud: Path, options: CorrectionOptions, most: int = MOST_DRAWN
-) -> Correction:
+def add_lateral_errors(done: Correction, cloud: Path) -> None:
     """Add the effect of lateral errors to the uncertainty of each point of ``cloud``.
 
     Lateral errors change heights by the slope of the surface. Without a nominal surface the slope
     is that of a polynomial through all points, so the cloud is rewritten in a second pass.
 
-    most: points to keep for figures
-
-    Return ``done`` with their budget, largest uncertainty and points; unchanged if there is no
-    such source, or a nominal surface is given.
+    Budget, largest uncertainty and points of ``done`` have them then; all is as before if there is
+    no such source, or a nominal surface is given.
     """
+    trace, options = done.corrector.trace, done.options
     sources = [source for source in options.systematic if source.kind.needs_slope]
-    if not sources or options.surface is not None or not done.trace.seen:
-        return done
-    points = done.trace.points()
+    if not sources or options.surface is not None or not trace.seen:
+        return
+    points = trace.points()
     if not resolves_per_turn_waves(points):
         left_out = (
             f"{', '.join(dict.fromkeys(source.name for source in sources))}: not in the "
             "uncertainty of the points, because the slopes of the surface are unknown; give "
             "--nominal SURFACE.yaml"
         )
-        return replace(done, faults=(*done.faults, left_out))
+        done.faults = (*done.faults, left_out)
+        return
     by_source = standard_fields(sources, points.with_slopes(None))
-    fields = scan_fields(by_source, done.trace.every)
-    kept, largest = EvenSelection(most), 0.0
+    fields = scan_fields(by_source, trace.every)
+    kept, done.largest_uncertainty = EvenSelection(MOST_DRAWN), 0.0
 
     def variance(first: int, count: int) -> FloatArray:
         return np.asarray(np.sum(fields.at(first, count) ** 2, axis=0), np.float64)
 
     for rows in with_added_variance(cloud, variance):
         kept.add(rows)
-        largest = max(largest, float(rows["uncertainty"].max()))
+        largest = float(rows["uncertainty"].max())
+        done.largest_uncertainty = max(done.largest_uncertainty, largest)
     heights = {name: float(np.sqrt(np.mean(np.sum(f**2, axis=0)))) for name, f in by_source.items()}
-    budget = done.budget | heights
-    return replace(done, budget=budget, largest_uncertainty=largest, points=kept.rows())
+    done.budget, done.points = done.budget | heights, kept.rows()
 
 
 def correct_bag(
@@ -291,130 +368,13 @@ def correct_bag(
     Raises CalibrationError for a calibration that does not match the scan, unless overridden.
     """
     with Recording(path) as recording:
-        scan = CorrectedScan(
-            recording,
-            calibration,
-            options or CorrectionOptions(),
-            admission=admission,
-            by_stamps=by_stamps,
-        )
-        overridden = "; ".join(["OVERRIDDEN", *map(str, scan.reasons)]) if scan.reasons else ""
+        done = Correction(
+            recording, calibration, options or CorrectionOptions(), admission, by_stamps,
+            nominal, lateral,
+        )  # fmt: skip
+        overridden = "; ".join(["OVERRIDDEN", *map(str, done.reasons)]) if done.reasons else ""
         comment = f"omsm_ros, metres, calibration {calibration.id} {overridden}"
         with PlyWriter(cloud, comment) as ply:
-            found = _RunningResults(nominal, lateral, by_counter=by_stamps is None)
-            for block, points in scan.steps():
-                found.see(block)
-                if points is not None:
-                    if nominal is not None and lateral:
-                        points = with_lateral_uncertainty(points, nominal, lateral)
-                    found.add(points, ply.write(points))
-        return with_lateral_errors(found.correction(scan), cloud, scan.options)
-
-
-class _RunningResults:
-    """Statistics of the points and findings of the streams, gathered during the pass."""
-
-    def __init__(self, nominal: Surface | None, lateral: float, by_counter: bool) -> None:
-        self._nominal, self._lateral, self._by_counter = nominal, lateral, by_counter
-        self._axes, self._distance = StreamWatch(), StreamWatch()
-        self._z = (np.inf, -np.inf)
-        names = ("error",) if nominal is None else ("error", "raw", "corrected")
-        self._running = {name: RunningStatistics() for name in names}
-        self.largest = 0.0
-        self.drawn = EvenSelection(MOST_DRAWN)
-        self.path = ScanPathReader(MAX_PATH_SAMPLES)
-        self._blocks: list[AxisBlock] = []
-        self._points: list[SurfacePoints] = []
-        self._kept = 0
-
-    def see(self, block: AxisBlock | DistanceBlock | None) -> None:
-        if block is None:
-            return
-        self.path.add(block)
-        if isinstance(block, AxisBlock) and np.any(here := np.isfinite(block.z)):
-            low, high = self._z
-            self._z = (min(low, block.z[here].min()), max(high, block.z[here].max()))
-        if isinstance(block, AxisBlock) and self._kept <= _MOST_ADJUSTED:
-            self._blocks.append(block)
-        (self._axes if isinstance(block, AxisBlock) else self._distance).add(block)
-
-    def faults(self, scan: CorrectedScan) -> tuple[str, ...]:
-        """Return findings from counters and stamps; none of axes that are joined by stamps.
-
-        The first is that all points lie on one spot, as those of a step test; the last, that Z left
-        the range in which its pitch was measured.
-        """
-        found: list[Notice | str] = [*self._distance.faults("distance")]
-        if self._by_counter:
-            skew = counter_skew(self._axes, self._distance)
-            found = [*self._axes.faults("axes"), *found]
-            lapse = scan.time_lapse
-            found += [*self._axes.period_fault("axes", lapse)]
-            found += [*self._distance.period_fault("distance", lapse)]
-            stated = scan.options.sources
-            resolution = stated.encoder_resolution if stated else 0.0
-            found += self._axes.step_faults(resolution, self._lateral)
-            samples = scan.account.distance.counted.get("slipped", 0)
-            if samples:
-                found.append(
-                    f"{samples} samples were not corrected: {scan.corrector.pairing.watch.found}"
-                )
-            else:
-                found += skew_fault(skew, scan.sample_period, scan.options.trigger)
-        rows, pitch, (low, high) = self.drawn.rows(), scan.options.pitch, self._z
-        if len(rows) and max(np.ptp(rows["x"]), np.ptp(rows["y"])) < SPOT_M:
-            found.insert(
-                0,
-                f"all points lie within {quantity(SPOT_M, 'm')}: X and C did not scan a surface; "
-                "evaluate a step test with 'omsm identify', and test a calibration on one with "
-                "'omsm verify'",
-            )
-        if pitch is not None and (low < pitch.position[0] or pitch.position[-1] < high):
-            first, last = pitch.position[0], pitch.position[-1]
-            found.append(
-                f"Z goes from {quantity(low, 'm')} to {quantity(high, 'm')}, but its pitch was "
-                f"measured from {quantity(first, 'm')} to {quantity(last, 'm')} and taken as "
-                "constant beyond; measure it over the whole range of Z"
-            )
-        return tuple(map(str, found))
-
-    def add(self, points: SurfacePoints, packed: NDArray[np.void]) -> None:
-        self.drawn.add(packed)
-        if not len(points):
-            return
-        self.largest = max(self.largest, float(points.uncertainty.max()))
-        self._kept += len(points)
-        if self._kept <= _MOST_ADJUSTED:
-            self._points.append(points)
-        else:
-            self._points, self._blocks = [], []
-        x, y, error = points.x, points.y, points.dynamic_error
-        self._running["error"].add(x, y, error)
-        if self._nominal is not None:
-            corrected = deviation(x, y, points.height, self._nominal)
-            self._running["corrected"].add(x, y, corrected)
-            self._running["raw"].add(x, y, corrected + error)
-
-    def correction(self, scan: CorrectedScan) -> Correction:
-        """Return the result of the whole pass."""
-        running = self._running.items() if len(self.drawn) else ()
-        data, period = None, scan.sample_period
-        with suppress(DataError):  # points that make no scan
-            data = scan_data(self._blocks, self._points, period)[0] if self._points else None
-        return Correction(
-            account=scan.account.as_dict(),
-            budget=scan.corrector.budget,
-            stamp_skew=scan.corrector.pairing.stamp_skew,
-            admission=scan.admitted,
-            reasons=scan.reasons,
-            statistics={name: one.statistics() for name, one in running},
-            largest_uncertainty=self.largest,
-            points=self.drawn.rows(),
-            trace=scan.corrector.trace,
-            path=self.path.path(),
-            sample_period=period,
-            recorded_ns=scan.recorded_ns,
-            temperatures=scan.temperatures,
-            faults=self.faults(scan),
-            scan=data,
-        )
+            done.write(ply)
+        add_lateral_errors(done, cloud)
+        return done

@@ -24,8 +24,15 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.deviation import deviation
 from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
-from omsm_ros.io.files import DIFFERENCE, REPORT, SUMMARY, SYSTEMATIC, save_json, save_text
-from omsm_ros.io.folders import read_result
+from omsm_ros.io.files import (
+    DIFFERENCE,
+    REPORT,
+    SUMMARY,
+    SYSTEMATIC,
+    read_result,
+    save_json,
+    save_text,
+)
 from omsm_ros.io.maps.columns_file import write_columns
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.results import load_fields

@@ -18,8 +18,7 @@ from omsm_ros.core.calibration.repeatability import trend
 from omsm_ros.errors import ConfigurationError, FileError, OmsmError
 from omsm_ros.io import bags, json_and_yaml
 from omsm_ros.io.calibration_file import load_calibration
-from omsm_ros.io.files import SUMMARY, exception_text, read_text
-from omsm_ros.io.folders import MAX_RESULT_BYTES
+from omsm_ros.io.files import MAX_RESULT_BYTES, SUMMARY, exception_text, read_text
 from omsm_ros.quantities import COUNTER, SIGNAL, shown
 from omsm_ros.report.tables import part
 from omsm_ros.report.verdict import verdict_text

@@ -12,8 +12,7 @@ from omsm_ros.core.estimation.sampled_model import SCHEMA, SCHEMA_1, SampledMode
 from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import Identification
 from omsm_ros.errors import CalibrationError, DataError, FileError, named_errors
-from omsm_ros.io.files import load_object, save_json, save_text
-from omsm_ros.io.folders import result_folder
+from omsm_ros.io.files import load_object, result_folder, save_json, save_text
 from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
 from omsm_ros.io.tables.text_table import PLAIN, TextTable, load_columns
 from omsm_ros.readable import now_text, quantity

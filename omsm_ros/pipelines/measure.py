@@ -82,7 +82,8 @@ def _budget(
 
     discretisation: rms of the digital filter's error on the scan's path [m]
     """
-    trace = done.trace.points()
+    traced = done.corrector.trace
+    trace = traced.points()
     budget = scan_budget(
         calibration,
         options.sources or ErrorSources.of(calibration),
@@ -93,7 +94,7 @@ def _budget(
         trace.with_slopes(options.surface) if len(trace) else trace,
     )
     if len(trace) and resolves_per_turn_waves(trace):
-        kept = scan_fields(budget.fields, done.trace.every, budget.bounds)
+        kept = scan_fields(budget.fields, traced.every, budget.bounds)
         save_fields(out / SYSTEMATIC, kept)
     return budget.entry()
 
@@ -220,12 +221,13 @@ def _losses(done: Correction) -> Iterator[str | Notice]:
             f"the calibration was used although {text}; identify with the settings of the scan, "
             "and correct with that calibration"
         )
-    if beyond := done.account["axes"]["counted"].get("beyond"):
+    account = done.account.as_dict()
+    if beyond := account["axes"]["counted"].get("beyond"):
         yield (
             f"{beyond} samples lie beyond the range of the calibration set; calibrate there, too, "
             "and make a new set with 'omsm calset'"
         )
-    for name, stream in done.account.items():
+    for name, stream in account.items():
         lost = stream["received"] - stream["corrected"]
         if lost > (1 - _LEAST_SHARE_CORRECTED) * stream["received"]:
             share = 100 * lost / stream["received"]
@@ -309,10 +311,10 @@ def _summarise(
         "bag": str(bag),
         "calibration": calibration.id,
         **places,
-        "samples": done.account,
+        "samples": done.account.as_dict(),
         "uncertainty_budget": done.budget,
         "sample_period": done.sample_period,
-        "stamp_skew": done.stamp_skew,
+        "stamp_skew": done.corrector.pairing.stamp_skew,
         "conditions": conditions(done, calibration),
         "settings": dict(calibration.settings),
         "latency": latency_summary(calibration.latency),
@@ -322,7 +324,7 @@ def _summarise(
             **{name: metadata.version(name) for name in ("numpy", "scipy", "rosbags")},
         },
         "files": {"cloud": CLOUD, "summary": SUMMARY},
-        "admission": done.admission,
+        "admission": done.admitted,
         "warnings": [*(f"overridden: {reason}" for reason in done.reasons)],
     }
     if lost := int(np.sum(~np.isfinite(done.temperatures))):

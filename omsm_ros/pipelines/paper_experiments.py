@@ -18,8 +18,14 @@ from omsm_ros.core.ripple.source_hypotheses import ALIASED, PART
 from omsm_ros.core.ripple.vibration_removal import REMOVED
 from omsm_ros.core.streams.blocks import AccelerationBlock, FloatArray
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
-from omsm_ros.io.files import EXPERIMENT, REPORT, save_json, save_text
-from omsm_ros.io.folders import EXPERIMENT_FILES, result_folder
+from omsm_ros.io.files import (
+    EXPERIMENT,
+    EXPERIMENT_FILES,
+    REPORT,
+    result_folder,
+    save_json,
+    save_text,
+)
 from omsm_ros.pipelines.record_bags import write_recording
 from omsm_ros.pipelines.spectrum import SpectrumOfScan, SpectrumOptions, spectra_of, summary_of
 from omsm_ros.pipelines.verify_calibration import path_check_of

@@ -39,8 +39,7 @@ from omsm_ros.core.ripple.vibration_removal import REMOVED, RemovedVibration, re
 from omsm_ros.core.streams.blocks import AccelerationBlock, FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import bags
-from omsm_ros.io.files import REPORT, SPECTRUM, save_json, save_text
-from omsm_ros.io.folders import result_folder
+from omsm_ros.io.files import REPORT, SPECTRUM, result_folder, save_json, save_text
 from omsm_ros.io.maps.columns_file import write_columns
 from omsm_ros.io.results import PlyWriter
 from omsm_ros.io.topics import AnyBag

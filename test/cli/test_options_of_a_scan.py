@@ -169,8 +169,8 @@ def test_an_aperture_limits_what_is_fitted_and_a_tolerance_judges_it(corrected, 
 def test_what_is_known_of_the_geometry_is_kept_by_align(
     capsys, tmp_path, folder, calibration, monkeypatch
 ):
+    from omsm_ros.cli import adjust
     from omsm_ros.errors import DataError
-    from omsm_ros.pipelines import study_scans
 
     asked = []
 
@@ -178,7 +178,7 @@ def test_what_is_known_of_the_geometry_is_kept_by_align(
         asked.append((radius, known))
         raise DataError("enough")
 
-    monkeypatch.setattr(study_scans, "alignment_of", refuse)
+    monkeypatch.setattr(adjust, "alignment_of", refuse)
     (tmp_path / "known.yaml").write_text("abbe_arm: 0.12\nprobe_z: 0.3\n")
     words = ["align", folder / "scan.mcap", "--calibration", calibration, "--radius", "-0.05"]
     words += ["--geometry", tmp_path / "known.yaml", "--out", tmp_path / "geometry.yaml"]

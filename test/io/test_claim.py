@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from omsm_ros.errors import ConfigurationError, FileError
-from omsm_ros.io.folders import exclusive_lock
+from omsm_ros.io.files import exclusive_lock
 
 HOLDER = (
-    "import sys, time; from pathlib import Path; from omsm_ros.io.folders import exclusive_lock\n"
+    "import sys, time; from pathlib import Path; from omsm_ros.io.files import exclusive_lock\n"
     "with exclusive_lock(Path(sys.argv[1])):\n"
     "    print('held', flush=True); time.sleep(60)\n"
 )

@@ -11,8 +11,15 @@ from pathlib import Path
 import pytest
 
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import atomic_file, exception_text, open_regular, read_text, save_text
-from omsm_ros.io.folders import read_result, result_folder
+from omsm_ros.io.files import (
+    atomic_file,
+    exception_text,
+    open_regular,
+    read_result,
+    read_text,
+    result_folder,
+    save_text,
+)
 
 NAMES = ("cloud", "form", "report", "summary")
 

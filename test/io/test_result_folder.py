@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import atomic_file, save_text
-from omsm_ros.io.folders import FORM_FILES, MEASUREMENT_FILES, result_folder
+from omsm_ros.io.files import FORM_FILES, MEASUREMENT_FILES, atomic_file, result_folder, save_text
 
 NAMES = ("cloud", "report", "summary")
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from omsm_ros.errors import FileError
-from omsm_ros.io.folders import runtime_folder
+from omsm_ros.io.files import runtime_folder
 
 
 @pytest.fixture(autouse=True)

@@ -135,7 +135,7 @@ def test_a_foreign_calibration_is_refused_before_anything_is_written(
 def test_overridden_it_says_so_in_the_cloud(bag, true_calibration, tmp_path):
     foreign = Admission({"machine": "another"}, override=True)
     done = correct_bag(bag, true_calibration, tmp_path / "cloud.ply", admission=foreign)
-    assert done.admission["overridden"]
+    assert done.admitted["overridden"]
     assert any("another" in str(reason) for reason in done.reasons)
     assert b"OVERRIDDEN" in (tmp_path / "cloud.ply").read_bytes()[:512]
 

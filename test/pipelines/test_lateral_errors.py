@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from omsm_ros.core.correction.machine_sources import MachineSources, StatedSourc
 from omsm_ros.core.correction.systematic import ScanTrace
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.io.results import CloudFile
-from omsm_ros.pipelines.correct import Correction, correct_bag, with_lateral_errors
+from omsm_ros.pipelines.correct import add_lateral_errors, correct_bag
 from omsm_ros.pipelines.measure import live_verdict, with_sources
 
 from .test_corrected_scan import write
@@ -72,12 +74,12 @@ def test_points_too_far_apart_for_the_turns_say_so(tmp_path, small_scan, true_ca
         np.zeros((2, len(points))),
         np.zeros(len(points)),
     )
-    done = Correction({}, {}, None, {}, (), {}, 0.0, np.empty(0), trace, None, 1e-3, None,
-                      np.empty(0))  # fmt: skip
-    found = with_lateral_errors(done, tmp_path / "none.ply", options)
-    assert not found.budget
-    assert "centre_x" in found.faults[0]
-    assert "--nominal" in found.faults[0]
+    corrector.trace = trace
+    done = SimpleNamespace(corrector=corrector, options=options, budget={}, faults=())
+    add_lateral_errors(done, tmp_path / "none.ply")
+    assert not done.budget
+    assert "centre_x" in done.faults[0]
+    assert "--nominal" in done.faults[0]
 
 
 def test_live_without_a_surface_the_verdict_says_what_is_not_in_the_points(
