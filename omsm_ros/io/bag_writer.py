@@ -70,15 +70,11 @@ class GrowingFile:
         """Return the number of bytes taken so far."""
         return self._written + len(self._waiting)
 
-    def flush(self) -> None:
-        """Write the waiting bytes and an end, or none of them: OSError without space."""
-        self._append(END)
+    def flush(self, end: bytes = END) -> None:
+        """Write the waiting bytes and an ``end``, or none of them: OSError without space.
 
-    def complete(self) -> None:
-        """Write the waiting bytes, which have their own end; OSError as :meth:`flush`."""
-        self._append(b"")
-
-    def _append(self, end: bytes) -> None:
+        end: empty for bytes that have their own
+        """
         if not self._waiting:
             return
         piece, self._waiting = self._waiting, bytearray()
@@ -328,4 +324,4 @@ class _PackedIndex:
 def finish(writer: Writer, file: GrowingFile) -> None:
     """Write the index; OSError without space, and then the bag is readable without index."""
     writer.finish()
-    file.complete()
+    file.flush(b"")

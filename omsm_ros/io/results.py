@@ -137,7 +137,7 @@ class CloudFile:
 
 
 def with_added_variance(
-    path: Path, variance: Callable[[int, int], FloatArray], size: int = 500_000
+    path: Path, variance: Callable[[int, int], FloatArray]
 ) -> Iterator[NDArray[np.void]]:
     """Add a variance to the uncertainty of each point of our cloud, and yield the points.
 
@@ -145,7 +145,7 @@ def with_added_variance(
     """
     first = 0
     with path.open("r+b") as stream:
-        for before in CloudFile(path).portions(size):
+        for before in CloudFile(path).portions():
             rows = before.copy()
             spread = before["uncertainty"].astype(np.float64)
             rows["uncertainty"] = np.sqrt(spread**2 + variance(first, len(rows)))

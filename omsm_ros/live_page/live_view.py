@@ -263,11 +263,6 @@ class LiveView:
             kept = np.concatenate([self._acceleration, rows])
             self._acceleration = kept[-_SPECTRUM_SAMPLES:]
 
-    def restart(self) -> None:
-        """Begin a new map."""
-        with self._lock:
-            self._restart()
-
     def _restart(self) -> None:
         self._map.restart()
         self._series.clear()

@@ -199,33 +199,25 @@ class DemoNode(Node):
         return answer
 
 
-class DemoStage:
-    """Shows the progress of a stage: a bar on a terminal, a line elsewhere."""
-
-    def __init__(self, quiet: bool) -> None:
-        self._quiet = quiet
-
-    @contextmanager
-    def __call__(self, title: str, total: int = 0) -> Iterator[Callable[[int], None]]:
-        plain = not sys.stderr.isatty()
-        if plain and not self._quiet:
-            print(f"· {title}", file=sys.stderr, flush=True)
-        layout = (
-            "{desc:<44} {percentage:3.0f}% |{bar:24}| {remaining} left"
-            if total
-            else "{desc} {elapsed}"
-        )
-        silent = self._quiet or plain
-        with (
-            tqdm(desc=title, total=total or None, disable=silent, bar_format=layout) as bar,
-            refresh_in_thread(partial(tick, bar.refresh)),
-        ):
-            yield lambda done: bar.update(done - bar.n)  # type: ignore[misc]
-            bar.update((total or bar.n) - bar.n)
+@contextmanager
+def demo_stage(title: str, total: int = 0, quiet: bool = False) -> Iterator[Callable[[int], None]]:
+    """Show the progress of a stage: a bar on a terminal, a line elsewhere, nothing if ``quiet``."""
+    plain = not sys.stderr.isatty()
+    if plain and not quiet:
+        print(f"· {title}", file=sys.stderr, flush=True)
+    layout = (
+        "{desc:<44} {percentage:3.0f}% |{bar:24}| {remaining} left" if total else "{desc} {elapsed}"
+    )
+    with (
+        tqdm(desc=title, total=total or None, disable=quiet or plain, bar_format=layout) as bar,
+        refresh_in_thread(partial(tick, bar.refresh)),
+    ):
+        yield lambda done: bar.update(done - bar.n)  # type: ignore[misc]
+        bar.update((total or bar.n) - bar.n)
 
 
 def perform(
-    node: DemoNode, processes: NodeProcesses, plan: Demonstration, stage: DemoStage
+    node: DemoNode, processes: NodeProcesses, plan: Demonstration, stage: Callable[..., Any]
 ) -> None:
     """Run the cell: step test, identification, scan, recording."""
     with stage("starting the cell and its nodes"):
@@ -374,7 +366,7 @@ def main() -> None:
         disturbance_file=args.disturbances,
         view=args.view,
     )
-    stage = DemoStage(quiet=args.json)
+    stage = partial(demo_stage, quiet=args.json)
     try:
         rclpy.init()
         plan.prepare()

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 from omsm_msgs import msg
 from rclpy.publisher import Publisher
@@ -54,19 +54,11 @@ _END_S = 5.0
 _DARK_REFERENCE_S = 30.0
 
 
-class _Output(NamedTuple):
-    """Message of a kind of blocks, and the parameter of its frame."""
-
-    message: type
-    frame: Parameter
-
-
-_OUTPUTS: Mapping[type[Block], _Output] = {
-    AxisBlock: _Output(msg.AxisBlock, Parameter("machine_frame", "machine", "frame of the axes")),
-    DistanceBlock: _Output(
-        msg.DistanceBlock, Parameter("probe_frame", "probe", "frame of the distance")
-    ),
-    AccelerationBlock: _Output(
+# Message of a kind of blocks, and the parameter of its frame.
+_OUTPUTS: Mapping[type[Block], tuple[type, Parameter]] = {
+    AxisBlock: (msg.AxisBlock, Parameter("machine_frame", "machine", "frame of the axes")),
+    DistanceBlock: (msg.DistanceBlock, Parameter("probe_frame", "probe", "frame of the distance")),
+    AccelerationBlock: (
         msg.AccelerationBlock,
         Parameter("accelerometer_frame", "probe", "frame of the acceleration"),
     ),
@@ -85,7 +77,7 @@ class DriverNode(ManagedNode):
         settings: str | None = None,
     ) -> None:
         """topics: of each kind of blocks;  settings: topic of the probe's settings; None = none."""
-        frames = (_OUTPUTS[kind].frame for kind in topics)
+        frames = (_OUTPUTS[kind][1] for kind in topics)
         super().__init__(name, (*parameters, *frames, FRAME_PREFIX))
         self._make = make
         self._topics = topics
@@ -113,7 +105,7 @@ class DriverNode(ManagedNode):
             self._settings = publish_on(self, undo, String, self._settings_topic, LATCHED_QOS)
             self._plotted = publish_on(self, undo, msg.ProbeSettings, "probe", LATCHED_QOS)
         self._publisher_of = {
-            kind: self.publish_on(undo, _OUTPUTS[kind].message, topic)
+            kind: self.publish_on(undo, _OUTPUTS[kind][0], topic)
             for kind, topic in self._topics.items()
             if kind is not AxisBlock or self._device.channels.axes is not None
         }
@@ -132,7 +124,7 @@ class DriverNode(ManagedNode):
         for item in blocks:
             for block in item if isinstance(item, tuple) else (item,):
                 if (publisher := self._publisher_of.get(type(block))) is not None:
-                    frame = self.values[_OUTPUTS[type(block)].frame.name]
+                    frame = self.values[_OUTPUTS[type(block)][1].name]
                     publisher.publish(message_mapping.block_message(self._messages, block, frame))
 
     def _publish_settings(self) -> None:

@@ -37,12 +37,7 @@ PARAMETERS = (
     Parameter("nominal", "", "SURFACE.yaml that heights are compared with; empty = none"),
 )
 _MAX_TOKEN_BYTES = 1000
-_LEVELS = {
-    DiagnosticStatus.OK: "OK",
-    DiagnosticStatus.WARN: "WARN",
-    DiagnosticStatus.ERROR: "ERROR",
-    DiagnosticStatus.STALE: "STALE",
-}
+_LEVELS = {getattr(DiagnosticStatus, name): name for name in ("OK", "WARN", "ERROR", "STALE")}
 
 
 class ViewerNode(ManagedNode):

@@ -153,8 +153,7 @@ def uncertainty_map(found: Adjustment) -> Figure:
 def _map(
     found: Adjustment, values: Any, colours: str, limits: tuple[float, float], name: str
 ) -> Figure:
-    made, axes = style.figure(6.1, 5.0)
-    ax = axes[0, 0]
+    made, (ax,) = style.figure(6.1, 5.0)
     drawn = ax.tripcolor(
         found.form.x / MILLIMETRE_M, found.form.y / MILLIMETRE_M, values,
         cmap=colours, vmin=limits[0], vmax=limits[1], shading="gouraud",
@@ -170,11 +169,11 @@ def _map(
 def profiles(found: Adjustment) -> Figure:
     """Draw sections along x, y and 45° with their band."""
     form = found.form
-    made, axes = style.figure(9.2, 5.5, 3, 1, sharex=True)
+    made, axes = style.figure(9.2, 5.5, 3, sharex=True)
     radius = np.hypot(form.x, form.y)
     width = 0.06 * float(np.max(radius))
     for ax, (name, angle) in zip(
-        axes[:, 0], (("x", 0.0), ("y", np.pi / 2), ("45°", np.pi / 4)), strict=True
+        axes, (("x", 0.0), ("y", np.pi / 2), ("45°", np.pi / 4)), strict=True
     ):
         along = form.x * np.cos(angle) + form.y * np.sin(angle)
         across = form.y * np.cos(angle) - form.x * np.sin(angle)
@@ -187,14 +186,13 @@ def profiles(found: Adjustment) -> Figure:
                         linewidth=0)  # fmt: skip
         ax.plot(position, height, ".-", color=style.AFTER, linewidth=0.9, markersize=3)
         style.label(ax, y="deviation [nm]", title=f"along {name}")
-    style.label(axes[-1, 0], x="position [mm]")
+    style.label(axes[-1], x="position [mm]")
     return made
 
 
 def agreement(found: Adjustment) -> Figure:
     """Draw E_n of PV, rms and terms of each scan against the others."""
-    made, axes = style.figure(9.2, 3.4)
-    ax = axes[0, 0]
+    made, (ax,) = style.figure(9.2, 3.4)
     names = ["PV", "rms", *(f"Z({t.n},{t.m})" for t in found.form.terms)]
     width = 0.8 / max(len(found.agreement), 1)
     for k, one in enumerate(found.agreement):

@@ -192,7 +192,7 @@ def _figure(measurements: Sequence[CampaignEntry], judged: Sequence[JudgedSeries
     timed = np.any(np.isfinite(times)) and np.nanmax(times) > np.nanmin(times)
     x = (times - np.nanmin(times)) / DAY_S if timed else np.arange(len(measurements))
     made, axes = style.figure(10.0, 2.1 * len(judged) + 0.5, rows=len(judged), sharex=True)
-    for one, panel in zip(judged, axes[:, 0], strict=True):
+    for one, panel in zip(judged, axes, strict=True):
         usual = ~one.outlying
         per_unit, unit = one.series.drawn
         values = one.values / per_unit
@@ -204,11 +204,11 @@ def _figure(measurements: Sequence[CampaignEntry], judged: Sequence[JudgedSeries
                 min(0.0, float(np.nanmin(values))), 1.05 * (float(np.nanmax(values)) or 1.0)
             )
         style.label(panel, y=unit, title=one.series.name)
-    style.label(axes[-1, 0], x="days since the first recording" if timed else "")
+    style.label(axes[-1], x="days since the first recording" if timed else "")
     if not timed:
         shown = range(0, len(measurements), 1 + (len(measurements) - 1) // _MOST_NAMES)
         names = [style.named(measurements[i].name)[-_LONGEST_NAME:] for i in shown]
-        axes[-1, 0].set_xticks(shown, names)
+        axes[-1].set_xticks(shown, names)
     return style.png(made, dpi=120)
 
 
@@ -217,8 +217,7 @@ _COLOURS = (style.AFTER, style.BEFORE, "#009E73", "#CC79A7", "#E69F00", "#56B4E9
 
 def draw(machines: Sequence[Mapping[str, Any]]) -> bytes:
     """Draw lag, gain and form over time (PNG), a colour per machine; crosses are rejected."""
-    made, axes = style.figure(10.0, 7.0, rows=3, sharex=True)
-    lag, gain, form = axes[:, 0]
+    made, (lag, gain, form) = style.figure(10.0, 7.0, rows=3, sharex=True)
     for i, machine in enumerate(machines):
         colour = _COLOURS[i % len(_COLOURS)]
         for rejected, mark in ((False, "o"), (True, "x")):
@@ -231,11 +230,11 @@ def draw(machines: Sequence[Mapping[str, Any]]) -> bytes:
     style.label(lag, y="µs", title="Low-frequency delay, k = 2")
     style.label(gain, title="Static gain, k = 2")
     style.label(form, y="nm", title="Form deviation, rms, k = 2", x="recorded (UTC)")
-    bare = [panel for panel in (lag, gain, form) if not panel.containers]
+    bare = [panel for panel in made.axes if not panel.containers]
     for panel in bare:
         panel.set_yticks([])
         panel.text(0.5, 0.5, "none recorded", transform=panel.transAxes, ha="center")
-    if len(bare) == len(axes):
+    if len(bare) == len(made.axes):
         form.set_xticks([])  # without a date the axis would begin in 1970
     else:
         locator = AutoDateLocator()

@@ -52,8 +52,7 @@ def profiles(found: Comparison) -> dict[str, Figure]:
 
 def terms(numbers: Sequence[ComparedTerm]) -> Figure:
     """Draw E_n of the Zernike terms of the difference, the bounds at ±1."""
-    made, axes = style.figure(6.1, 3.6)
-    ax = axes[0, 0]
+    made, (ax,) = style.figure(6.1, 3.6)
     values = np.array([term.e_n for term in numbers])
     colours = np.where(np.abs(values) > 1, style.BEFORE, style.AFTER)
     ax.bar(np.arange(len(values)), values, color=list(colours), width=0.75)

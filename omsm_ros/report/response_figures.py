@@ -35,8 +35,9 @@ def bode(identified: Calibration, true: HasResponse | None, sample_period: float
     sample_period: of the scan that is corrected [s]; its Nyquist frequency ends the axes
     """
     frequency = np.geomspace(_LOWEST_HZ, 0.5 / sample_period, 600)
-    made, axes = style.figure(6.1, 5.6, rows=3, sharex=True, height_ratios=(1, 1, 1.15))
-    gain, phase, error = axes[:, 0]
+    made, (gain, phase, error) = style.figure(
+        6.1, 5.6, rows=3, sharex=True, height_ratios=(1, 1, 1.15)
+    )
     draw_response(gain, phase, frequency, identified, true)
     _draw_error(error, frequency, identified, true)
     return made
@@ -142,8 +143,7 @@ def step_response(
     period = float(np.median(np.diff(time)))
     before, after = round(30 * MILLISECOND_S / period), round(60 * MILLISECOND_S / period)
     window = slice(max(middle - before, 0), middle + after)
-    made, axes = style.figure(6.1, 5.6, rows=2, sharex=True, height_ratios=(1.25, 1))
-    upper, lower = axes[:, 0]
+    made, (upper, lower) = style.figure(6.1, 5.6, rows=2, sharex=True, height_ratios=(1.25, 1))
     edge = encoder[window]
     begin = int(np.argmax(np.abs(edge - edge[0]) > 0.01 * np.ptp(edge)))
     since = (time[window] - time[window][begin]) / MILLISECOND_S

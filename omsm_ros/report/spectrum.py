@@ -49,9 +49,9 @@ def densities(
     shown = [(s, n) for s, n in scans if not over or PATH in s.coordinates]
     if not shown:
         return None
-    made, axes = style.figure(_WIDTH_IN, _ROW_IN * len(shown) + 0.3, len(shown), 1, sharex=True)
+    made, axes = style.figure(_WIDTH_IN, _ROW_IN * len(shown) + 0.3, len(shown), sharex=True)
     unit, what = ("nm·√mm", "along the path") if over else ("nm/√Hz", "over time")
-    for row, (studied, named) in zip(axes[:, 0], shown, strict=True):
+    for row, (studied, named) in zip(axes, shown, strict=True):
         signal, found = studied.signal, studied.density(coordinate)
         frequency, level = smoothed(found)
         style.logarithmic(row.xaxis)
@@ -72,11 +72,11 @@ def densities(
     if not over:
         kinds = {row.kind for _, named in shown for row in named}
         for kind in (kind for kind in KINDS if kind in kinds):
-            axes[0, 0].plot([], [], "o", color=COLOURS[kind], markersize=5, label=kind)
+            axes[0].plot([], [], "o", color=COLOURS[kind], markersize=5, label=kind)
         if kinds:
-            style.legend_above(axes[0, 0])
+            style.legend_above(axes[0])
     along = "wavelength [µm]; dotted: twice the sampling distance"
-    style.label(axes[-1, 0], x=along if over else "frequency [Hz]")
+    style.label(axes[-1], x=along if over else "frequency [Hz]")
     return made
 
 
@@ -87,8 +87,7 @@ def _place(frequency: Any, over: bool) -> Any:
 
 def motion(spectra: Sequence[tuple[str, Density]], valid_up_to: float | None) -> Figure:
     """Draw the density of the motion of Z and the calibrated band (Fig. 7c)."""
-    made, axes = style.figure(_WIDTH_IN, 3.0)
-    one = axes[0, 0]
+    made, (one,) = style.figure(_WIDTH_IN, 3.0)
     style.logarithmic(one.xaxis)
     if any(np.any(spectrum.density > 0) for _, spectrum in spectra):
         style.logarithmic(one.yaxis)
@@ -115,8 +114,7 @@ def evidence(scans: Sequence[tuple[StudiedScan, Sequence[NamedLine]]]) -> Figure
     """
     if not any(TIME in row.line.possible for _, named in scans for row in named):
         return None
-    made, axes = style.figure(_WIDTH_IN, 0.5 * len(scans) + 1.2)
-    one = axes[0, 0]
+    made, (one,) = style.figure(_WIDTH_IN, 0.5 * len(scans) + 1.2)
     for level, (_, named) in enumerate(scans):
         for row in named:
             if TIME in row.line.possible:

@@ -28,7 +28,7 @@ MAP_COLOURS = "RdYlBu_r"
 
 # Margins of the axes [inch]: a layout computed for each figure would take longer than drawing.
 _LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN = 0.78, 0.14, 0.46, 0.34
-_BETWEEN_ROWS_IN, _BETWEEN_SHARED_ROWS_IN, _BETWEEN_COLUMNS_IN = 0.78, 0.32, 0.84
+_BETWEEN_ROWS_IN, _BETWEEN_SHARED_ROWS_IN = 0.78, 0.32
 _NAME_LEFT_OF_AXES_IN = 0.58
 
 TEXT_PT = 8.5
@@ -45,27 +45,24 @@ def empty(width: float, height: float) -> Figure:
     return made
 
 
-def figure(
-    width: float, height: float, rows: int = 1, columns: int = 1, **options: Any
-) -> tuple[Figure, np.ndarray]:
-    """Return a figure of ``width`` × ``height`` [inch] and its axes, shape (rows, columns).
+def figure(width: float, height: float, rows: int = 1, **options: Any) -> tuple[Figure, list[Axes]]:
+    """Return a figure of ``width`` × ``height`` [inch] and its axes, one below the other.
 
     options: of matplotlib's ``subplots``, such as ``sharex`` and ``height_ratios``
     """
     made = empty(width, height)
     between = _BETWEEN_SHARED_ROWS_IN if options.get("sharex") else _BETWEEN_ROWS_IN
     high = (height - _BOTTOM_IN - _TOP_IN - (rows - 1) * between) / rows
-    axes_width = (width - _LEFT_IN - _RIGHT_IN - (columns - 1) * _BETWEEN_COLUMNS_IN) / columns
+    axes_width = width - _LEFT_IN - _RIGHT_IN
     places = {
         "left": _LEFT_IN / width,
         "right": 1 - _RIGHT_IN / width,
         "bottom": _BOTTOM_IN / height,
         "top": 1 - _TOP_IN / height,
         "hspace": between / high,
-        "wspace": _BETWEEN_COLUMNS_IN / axes_width,
     }
-    axes = made.subplots(rows, columns, squeeze=False, gridspec_kw=places, **options)
-    for one in axes.flat:
+    axes = [*made.subplots(rows, squeeze=False, gridspec_kw=places, **options)[:, 0]]
+    for one in axes:
         quiet(one)
         one.yaxis.set_label_coords(-_NAME_LEFT_OF_AXES_IN / axes_width, 0.5)
     return made, axes
@@ -167,8 +164,8 @@ class Panel(NamedTuple):
 
 def panels(*shown: Panel) -> Figure:
     """Draw panels one below the other."""
-    made, axes = figure(9.2, 2.5 * len(shown) + 0.3, len(shown), 1)
-    for ax, panel in zip(axes[:, 0], shown, strict=True):
+    made, axes = figure(9.2, 2.5 * len(shown) + 0.3, len(shown))
+    for ax, panel in zip(axes, shown, strict=True):
         for (name, (x, y)), colour in zip(
             panel.curves.items(), (BEFORE, AFTER, TRUTH, MUTED), strict=False
         ):

@@ -35,16 +35,14 @@ class Table:
     prose: str = ""
 
 
-def filled(
-    title: str, items: Iterable[object], label: str, columns: Mapping[str, str], prose: str = ""
-) -> Table:
+def filled(title: str, items: Iterable[object], label: str, columns: Mapping[str, str]) -> Table:
     """Return a table of ``items``; label, columns: templates, as :mod:`omsm_ros.messages` has them.
 
     columns: name → template of its cells
     """
     templates = (label, *columns.values())
     rows = [tuple(text_from(template, item) for template in templates) for item in items]
-    return Table(title, tuple(columns), rows, prose)
+    return Table(title, tuple(columns), rows)
 
 
 def known_rows(rows: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:

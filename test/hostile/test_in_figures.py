@@ -18,10 +18,10 @@ NAMES = [r"$\frac$", "a$b$c^", "$$", "旋盤 7", "a\x1b[31m", "100 %_{"]
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_name_is_no_mathematics(name):
-    made, axes = style.figure(2.0, 2.0)
-    axes[0, 0].plot([], [], label=style.named(name))
-    style.label(axes[0, 0], y="nm", title=style.named(name))
-    axes[0, 0].legend()
+    made, (axes,) = style.figure(2.0, 2.0)
+    axes.plot([], [], label=style.named(name))
+    style.label(axes, y="nm", title=style.named(name))
+    axes.legend()
     assert style.png(made).startswith(b"\x89PNG")
 
 

@@ -2,6 +2,7 @@
 
 import json
 import signal
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.errors import DeviceTimeoutError
 from omsm_ros.io import bags
 from omsm_ros.io.calibration_file import load_calibration, save_calibration
-from omsm_ros.nodes.cell_demo_node import DemoStage, perform
+from omsm_ros.nodes.cell_demo_node import demo_stage, perform
 from omsm_ros.pipelines import demonstrate as demonstration
 from omsm_ros.readable import quantity
 
@@ -70,7 +71,7 @@ def test_calibrate_scan_correct_and_replay(cell, device):
         device=device,
     )
     plan.prepare()
-    perform(cell.operator, cell.processes, plan, DemoStage(quiet=True))
+    perform(cell.operator, cell.processes, plan, partial(demo_stage, quiet=True))
     summary = demonstration.finish_demonstration(plan)
 
     for stream in ("axes", "distance"):

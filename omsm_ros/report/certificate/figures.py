@@ -122,10 +122,10 @@ def residual(fitted: FittedRecord, noise: float | None) -> Figure:
     """
     at_edges = mean_at_edges(fitted, _BEFORE_EDGE_S, _AFTER_EDGE_S)
     made, axes = style.figure(6.1, 5.6, rows=2 + (at_edges is not None))
-    _draw_over_time(axes[0, 0], fitted, noise)
+    _draw_over_time(axes[0], fitted, noise)
     if at_edges is not None:
-        _draw_at_edges(axes[1, 0], at_edges, noise)
-    draw_correlation(axes[-1, 0], fitted.residual)
+        _draw_at_edges(axes[1], at_edges, noise)
+    draw_correlation(axes[-1], fitted.residual)
     return made
 
 
@@ -174,8 +174,7 @@ def draw_correlation(axes: Axes, left: FloatArray) -> None:
 
 def order(candidates: Sequence[CandidateFit], chosen: Structure | None) -> Figure:
     """Draw the residual of each candidate over its number of parameters."""
-    made, grid = style.figure(6.1, 2.7)
-    axes = grid[0, 0]
+    made, (axes,) = style.figure(6.1, 2.7)
     size = np.asarray([c.structure.size for c in candidates])
     rms = np.asarray([c.rms_m for c in candidates]) / NANOMETRE_M
     if rms.max() > 3 * rms.min() > 0:
@@ -206,8 +205,7 @@ def response(model: SampledModel) -> Figure:
     """Draw gain and phase to half the sampling rate with their 95 % band; grey: not valid."""
     frequency = np.geomspace(_LOWEST_SHARE, 1.0, _LINES) * 0.5 / model.sections.period
     value, band = model.sections.response(frequency)[0], model.sections.band(frequency)
-    made, axes = style.figure(7.4, 4.6, rows=2, sharex=True)
-    upper, lower = axes[:, 0]
+    made, (upper, lower) = style.figure(7.4, 4.6, rows=2, sharex=True)
     gain, spread = np.abs(value), np.exp(COVERAGE_FACTOR * np.minimum(band.gain, 5.0))
     draw_band(upper, frequency, gain / spread, gain, gain * spread)
     style.logarithmic(upper.yaxis)
@@ -231,8 +229,7 @@ def response(model: SampledModel) -> Figure:
 
 def record(model: SampledModel, inputs: FloatArray, output: FloatArray, run: FreeRun) -> Figure:
     """Draw the inputs, the output with the free run, and their difference over time."""
-    made, axes = style.figure(7.4, 6.2, rows=3, sharex=True)
-    given, both, left = axes[:, 0]
+    made, (given, both, left) = style.figure(7.4, 6.2, rows=3, sharex=True)
     inputs = inputs.reshape(len(inputs), -1)
     time = model.sections.period * np.arange(len(inputs))
     for column in inputs.T:
@@ -267,7 +264,7 @@ def model_figures_of(
 ) -> dict[str, bytes]:
     """Return PNG files for the page."""
     correlation, axes = style.figure(7.4, 2.6)
-    draw_correlation(axes[0, 0], run.residual)
+    draw_correlation(axes[0], run.residual)
     made = {
         BAND: response(model),
         RECORD: record(model, inputs, output, run),

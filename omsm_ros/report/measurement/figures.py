@@ -150,8 +150,7 @@ def profile(
     position, height: names of the axes, the horizontal one in mm
     lower: name and colour of the profile below;  band: its standard uncertainty, drawn as ±2u
     """
-    made, axes = style.figure(6.1, 3.6, rows=2, sharex=True)
-    first, second = axes[:, 0]
+    made, (first, second) = style.figure(6.1, 3.6, rows=2, sharex=True)
     for (name, cut), colour in zip(above.items(), (style.BEFORE, style.AFTER), strict=True):
         _draw_profile(first, cut, UNITS_M[unit], color=colour, label=name)
     name, colour = lower
@@ -194,7 +193,7 @@ def dynamic_error(
     """
     shown = uncertainty is not None
     made, axes = style.figure(6.1, 3.7 if shown else 2.2, rows=1 + shown, sharex=True)
-    upper, lower = axes[0, 0], axes[-1, 0]
+    upper, lower = axes[0], axes[-1]
     unit = unit_for(float(np.max(np.abs(before))))
     style.draw_envelope(upper, time, before / UNITS_M[unit], style.BEFORE)
     upper.axhline(0.0, color=style.MUTED, linewidth=0.6)
@@ -360,8 +359,7 @@ def form_figures(form: Mapping[str, Any], curves: Mapping[str, Any]) -> dict[str
 def zernike_terms(terms: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw ``terms``, each {n, m, value, uncertainty (k = 1)} [m], without piston and tilts."""
     shown = [t for t in terms if t["n"] > 1 and t["value"] is not None]
-    made, axes = style.figure(_WIDE, _HIGH)
-    ax = axes[0, 0]
+    made, (ax,) = style.figure(_WIDE, _HIGH)
     # Rotated numbers need more space below the axis.
     box = ax.get_position()
     ax.set_position((box.x0, _BELOW_BARS, box.width, box.y1 - _BELOW_BARS))
@@ -388,17 +386,16 @@ def curve_panels(
     made, axes = style.figure(
         _WIDE, (1.4 if sharex else 1.7) * len(curves) + 0.4, rows=len(curves), sharex=sharex
     )
-    for ax, (curve, (unit, along, title)) in zip(axes[:, 0], curves, strict=True):
+    for ax, (curve, (unit, along, title)) in zip(axes, curves, strict=True):
         _draw_curve(ax, curve, unit, NANOMETRE_M)
-        named = {} if sharex and ax is not axes[-1, 0] else {"x": along}
+        named = {} if sharex and ax is not axes[-1] else {"x": along}
         style.label(ax, y="deviation [nm]", title=title, **named)
     return made
 
 
 def radial_density(curve: Mapping[str, Any]) -> Figure:
     """Draw the density [nm² mm²] over radial frequency [1/mm], logarithmic, with ±2u."""
-    made, axes = style.figure(_WIDE, _HIGH)
-    ax = axes[0, 0]
+    made, (ax,) = style.figure(_WIDE, _HIGH)
     values = np.array(curve["value"], np.float64)
     least = float(np.min(values, where=values > 0, initial=np.max(values)))
     floor = max(_BELOW * least, _LEAST_SHARE * float(values.max()))
@@ -416,8 +413,7 @@ def radial_density(curve: Mapping[str, Any]) -> Figure:
 
 def direction_density(curve: Mapping[str, Any]) -> Figure:
     """Draw the mean square [nm²] per radian over the direction of waves [°], with ±2u."""
-    made, axes = style.figure(_WIDE, _HIGH)
-    ax = axes[0, 0]
+    made, (ax,) = style.figure(_WIDE, _HIGH)
     _draw_curve(ax, curve, DEGREE_RAD, NANOMETRE_M**2, floor=0.0)
     ax.set_xlim(0, 180)
     ax.set_xticks(range(0, 181, 30))
@@ -433,8 +429,7 @@ def areal_density(areal: Mapping[str, Any]) -> Figure:
     high = float(value.max()) or 1.0
     # The colour range covers nine tenths of the blocks.
     low = max(float(np.quantile(value, 0.1)), high * _LEAST_SHARE)
-    made, axes = style.figure(_WIDE, _HIGH)
-    ax = axes[0, 0]
+    made, (ax,) = style.figure(_WIDE, _HIGH)
     ax.grid(False)
     shown = ax.pcolormesh(
         x, y, np.maximum(value, low), norm=LogNorm(low, max(high, 2 * low)), cmap=style.MAP_COLOURS
