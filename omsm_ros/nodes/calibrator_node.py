@@ -63,9 +63,7 @@ _STREAMS = {"axes": AxisBlock, "confocal": DistanceBlock, "reference": DistanceB
 class CalibratorNode(ManagedNode):
     """Serves ``~/identify``; keeps every calibration, and publishes the one in force."""
 
-    def __init__(self) -> None:
-        super().__init__("calibrator", PARAMETERS)
-        self._messages = message_mapping.ros_messages()
+    name, parameters = "calibrator", PARAMETERS
 
     def configure(self, undo: ExitStack) -> None:
         """Load the calibration that was in force, and answer requests."""

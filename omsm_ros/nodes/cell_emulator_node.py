@@ -77,11 +77,9 @@ class CellEmulatorNode(ManagedNode):
     ends it. The action ``~/scan`` ends with the motion, and stops it when it is cancelled.
     """
 
+    name, parameters = "cell_emulator", PARAMETERS
     closes_last = True  # or a driver would report that it lost its port
-
-    def __init__(self) -> None:
-        super().__init__("cell_emulator", PARAMETERS)
-        self._link = ""
+    _link = ""
 
     def hardware_id(self) -> str:
         """Return the port."""
@@ -105,7 +103,6 @@ class CellEmulatorNode(ManagedNode):
             serve(self, undo, Trigger, f"~/{name}", partial(self._on_start, name))
         serve(self, undo, Trigger, "~/stop", self._on_stop)
         serve_action(self, undo, Scan, "~/scan", self._on_scan)
-        self._messages = message_mapping.ros_messages()
         self._acceleration_lines = self.publish_on(undo, AccelerationBlock, "acceleration")
         self._feed: AccelerationFeed | None = None
         self.get_logger().info(f"cell at {self._link}, time lapse {values['time_lapse']:g}")

@@ -200,9 +200,7 @@ _OVERRIDDEN = "_overridden"
 class CorrectorNode(ManagedNode):
     """Publishes points as soon as it has a calibration; a new one begins a new correction."""
 
-    def __init__(self) -> None:
-        super().__init__("corrector", PARAMETERS)
-        self._messages = message_mapping.ros_messages()
+    name, parameters = "corrector", PARAMETERS
 
     def configure(self, undo: ExitStack) -> None:
         """Load the initial calibration, and answer requests."""

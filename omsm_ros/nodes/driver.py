@@ -68,6 +68,8 @@ _OUTPUTS: Mapping[type[Block], tuple[type, Parameter]] = {
 class DriverNode(ManagedNode):
     """Reads a device and publishes its blocks."""
 
+    hardware = "port"
+
     def __init__(
         self,
         name: str,
@@ -83,11 +85,6 @@ class DriverNode(ManagedNode):
         self._topics = topics
         self._settings_topic = settings
         self._settings: Publisher | None = None
-        self._messages = message_mapping.ros_messages()
-
-    def hardware_id(self) -> str:
-        """Return the port."""
-        return str(self.values.get("port", ""))
 
     def configure(self, undo: ExitStack) -> None:
         """Make the device, not yet connected."""

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from enum import Enum
-from typing import Any
+from typing import Any, ClassVar
 
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import (
@@ -36,6 +36,7 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
 from omsm_ros.errors import ConfigurationError, OmsmError, one_line, shortened
+from omsm_ros.io import message_mapping
 from omsm_ros.nodes import topics
 from omsm_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, StateReport, log_internal_error
 from omsm_ros.nodes.memory import RETURN_PERIOD_S, return_free_memory
@@ -188,14 +189,20 @@ class LifecycleStage(Enum):
 class ManagedNode(LifecycleNode):  # type: ignore[misc]
     """A node with a lifecycle.
 
+    name, parameters: of a kind of which there is one node; others are given both
     values: its parameters, once it is configured
     fatal: an error that ends the node, with exit code 2
     closes_last: of the nodes of a process, since the others use what it offers
+    hardware: the parameter that names its device, or what stands for one; empty without
     """
 
+    name: ClassVar[str]
+    parameters: ClassVar[Sequence[Parameter]]
     closes_last = False
+    hardware = ""
 
-    def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
+    def __init__(self, name: str = "", parameters: Sequence[Parameter] = ()) -> None:
+        name, parameters = name or self.name, parameters or self.parameters
         try:
             super().__init__(name, namespace=NAMESPACE, cli_args=ARGUMENTS.get(name))
         except (
@@ -209,6 +216,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             raise ConfigurationError(f"{name}: {what}; give another __node or __ns") from err
         self.stage = LifecycleStage.UNCONFIGURED
         self.values: dict[str, Any] = {}
+        self._messages = message_mapping.ros_messages()
         self.fatal: OmsmError | None = None
         self._failure: Exception | None = None
         self._configured, self._activated = ExitStack(), ExitStack()
@@ -231,7 +239,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     def hardware_id(self) -> str:
         """Return the name of the node's device; empty without one."""
-        return ""
+        return str(self.values.get(self.hardware, ""))
 
     @property
     def active(self) -> bool:

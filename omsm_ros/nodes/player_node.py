@@ -269,12 +269,7 @@ _ANSWER_S = 1.0
 class PlayerNode(ManagedNode):
     """Publishes recorded messages unchanged; ends when all subscribers have processed the last."""
 
-    def __init__(self) -> None:
-        super().__init__("player", PARAMETERS)
-
-    def hardware_id(self) -> str:
-        """Return the bag's path."""
-        return str(self.values.get("bag", ""))
+    name, parameters, hardware = "player", PARAMETERS, "bag"
 
     def configure(self, undo: ExitStack) -> None:
         """Open the bag, and offer its topics."""

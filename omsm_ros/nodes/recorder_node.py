@@ -37,9 +37,8 @@ _LOOKS = 100
 class RecorderNode(ManagedNode):
     """Records serialised messages; all that are older than a second are on the disk."""
 
-    def __init__(self) -> None:
-        super().__init__("recorder", PARAMETERS)
-        self._bag: Any = None  # the writer of the bag, while active
+    name, parameters = "recorder", PARAMETERS
+    _bag: Any = None  # the writer of the bag, while active
 
     def hardware_id(self) -> str:
         """Return the bag's path."""

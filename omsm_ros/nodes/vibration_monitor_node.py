@@ -47,8 +47,7 @@ PARAMETERS = (
 class VibrationMonitorNode(ManagedNode):
     """Subscribes to ``acceleration`` and ``calibration``; publishes levels on ``vibration``."""
 
-    def __init__(self) -> None:
-        super().__init__("vibration_monitor", PARAMETERS)
+    name, parameters = "vibration_monitor", PARAMETERS
 
     def configure(self, undo: ExitStack) -> None:
         """Set options, alarm and calibration."""
@@ -62,7 +61,6 @@ class VibrationMonitorNode(ManagedNode):
                 axis=values["axis"],
             )
         )
-        self._messages = message_mapping.ros_messages()
         self._alarm = Alarm(values["alarm"], values["release"])
         self._refused, self._blocks_refused = "", 0
         self._lately = RecentIncrease()

@@ -43,9 +43,8 @@ _LEVELS = {getattr(DiagnosticStatus, name): name for name in ("OK", "WARN", "ERR
 class ViewerNode(ManagedNode):
     """Subscribes to points, calibration, acceleration and diagnostics, and shows them."""
 
-    def __init__(self) -> None:
-        super().__init__("viewer", PARAMETERS)
-        self._refused = 0
+    name, parameters = "viewer", PARAMETERS
+    _refused = 0
 
     def configure(self, undo: ExitStack) -> None:
         """Make the page and its content."""

@@ -37,7 +37,7 @@ class Driver(SimpleNamespace):
     report, _publish = DriverNode.report, DriverNode._publish
     _publish_settings = DriverNode._publish_settings
     _add_faults = DriverNode._add_faults
-    hardware_id = DriverNode.hardware_id
+    hardware_id, hardware = DriverNode.hardware_id, DriverNode.hardware
 
 
 @pytest.fixture
