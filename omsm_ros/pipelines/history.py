@@ -194,10 +194,14 @@ def time_of(stamp_ns: int | None) -> datetime | None:
     )
 
 
-_CALIBRATION_FIGURES = (
-    "static_gain", "static_gain_uncertainty", "delay", "delay_uncertainty", "valid_up_to",
-    "sample_period",
-)  # fmt: skip
+_CALIBRATION_FIGURES: Mapping[str, Callable[[Calibration], float | None]] = {
+    "static_gain": lambda c: c.static_gain,
+    "static_gain_uncertainty": lambda c: c.certificate.static_gain.uncertainty,
+    "delay": lambda c: c.dynamics.low_frequency_delay,
+    "delay_uncertainty": lambda c: c.low_frequency_delay_uncertainty,
+    "valid_up_to": lambda c: c.valid_up_to,
+    "sample_period": lambda c: c.sample_period,
+}
 # Column, and place of its value in the summary.
 _MEASUREMENT_FIGURES = {
     "deviation_rms": ("figures", "rms", "value"),
@@ -226,7 +230,7 @@ def _tables(sql: Any) -> dict[str, Any]:
         )  # fmt: skip
 
     calibrations = table(
-        "calibrations", ("verdict", "path", "source", "settings"), _CALIBRATION_FIGURES
+        "calibrations", ("verdict", "path", "source", "settings"), [*_CALIBRATION_FIGURES]
     )
     measurements = table(
         "measurements", ("bag", "folder", "version", "settings"), [*_MEASUREMENT_FIGURES],
@@ -258,12 +262,7 @@ def keep_calibration(
         "path": str(path.absolute()),
         "source": "" if source is None else str(source.absolute()),
         "settings": json_and_yaml.text_of(dict(calibration.settings)),
-        "static_gain": float(calibration.static_gain),
-        "static_gain_uncertainty": calibration.certificate.static_gain.uncertainty,
-        "delay": float(calibration.dynamics.low_frequency_delay),
-        "delay_uncertainty": float(calibration.low_frequency_delay_uncertainty),
-        "valid_up_to": float(calibration.valid_up_to),
-        "sample_period": float(calibration.sample_period),
+        **{name: _number(of(calibration)) for name, of in _CALIBRATION_FIGURES.items()},
     }
     with Catalogue(address) as catalogue:
         return catalogue.add("calibrations", row)

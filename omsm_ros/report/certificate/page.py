@@ -1,12 +1,12 @@
 """Pages to file, each HTML in one piece: certificate of a calibration, and a sampled model."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.calibration.certificate import REJECTED, Certificate, to_json
+from omsm_ros.core.calibration.certificate import REJECTED, to_json
 from omsm_ros.core.estimation.sampled_model import SCHEMA, FreeRun, SampledModel
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, response_band
 from omsm_ros.core.lti.transfer_function import Structure
@@ -156,79 +156,61 @@ def _range_headline(calibration: Calibration) -> Headline:
     return Headline(name, quantity(calibration.valid_up_to, "Hz"), "; ".join(details))
 
 
-def _model_errors(certificate: Certificate) -> Section:
-    return Section(
-        "Model errors, found and undetected",
-        (),
-        (
-            tables.model_error_table(certificate),
-            tables.consistency_table(certificate),
-            tables.undetected_table(certificate),
-        ),
-        "An effect larger than the largest undetected size would have been detected with a "
-        "probability of 95 %. The band contains what the test cannot exclude. The rms is that of "
-        "heights on the intended scan; the report of a measurement has that of its own scan.",
-    )
+def _sample_table(calibration: Calibration) -> Table:
+    samples = calibration.certificate.residual.samples
+    return Table("Samples", (), [(k.replace("_", " "), count(n)) for k, n in samples.items()])
 
 
-def _order(certificate: Certificate) -> Section:
-    return Section(
+# Title, figures, tables and note of the sections between the statements and the records.
+_SECTIONS: Sequence[tuple[str, tuple[str, ...], Sequence[Callable[[Calibration], Table]], str]] = (
+    ("Fit to the recording", ("step", "residual"), (tables.residual_table, _sample_table), ""),
+    (
         "Order",
         ("order",),
-        (tables.order_table(certificate),),
+        (tables.order_table,),
         "The chosen structure has one parameter more than that of the lowest BIC, and at least "
         "three, unless an order was requested. The smallest structure that fits is biased by "
         "about its own uncertainty; one parameter more turns this bias into a wider band.",
-    )
+    ),
+    (
+        "Dynamics",
+        (),
+        (tables.mode_table, tables.two_mass_table, tables.limit_table, tables.shape_table,
+         tables.coefficient_table),
+        "Uncertainties are standard, k = 1. Those of the coefficients are strongly "
+        "correlated; the calibration file has the whole covariance.",
+    ),
+    ("Static gain and background", (), (tables.gain_table, tables.background_table), ""),
+    (
+        "Model errors, found and undetected",
+        (),
+        (tables.model_error_table, tables.consistency_table, tables.undetected_table),
+        "An effect larger than the largest undetected size would have been detected with a "
+        "probability of 95 %. The band contains what the test cannot exclude. The rms is that of "
+        "heights on the intended scan; the report of a measurement has that of its own scan.",
+    ),
+)  # fmt: skip
 
 
 def sections(calibration: Calibration, issue: Issue) -> list[Section]:
     """Return all parts below the first screen that have anything to show."""
     certificate = calibration.certificate
     warnings = [(str(warning),) for warning in certificate.warnings]
-    samples = [(k.replace("_", " "), count(n)) for k, n in certificate.residual.samples.items()]
     further = dict(certificate.further)  # what has no other place on the page
     if certificate.self_calibration:
         further["self_calibration"] = certificate.self_calibration
-    identity = tables.identity_table(calibration, issue.source, issue.version)
+    records = (
+        tables.identity_table(calibration, issue.source, issue.version),
+        mapping_table("Settings calibrated for", calibration.settings),
+        mapping_table("Further entries", further),
+    )
     every = [
         Section("Warnings", (), (Table("", (), warnings),)),
         *_laboratory(calibration),
-        Section(
-            "Fit to the recording",
-            ("step", "residual"),
-            (tables.residual_table(certificate), Table("Samples", (), samples)),
-        ),
-        _order(certificate),
-        Section(
-            "Dynamics",
-            (),
-            (
-                tables.mode_table(calibration),
-                tables.two_mass_table(certificate),
-                tables.limit_table(certificate),
-                tables.shape_table(calibration),
-                tables.coefficient_table(calibration),
-            ),
-            "Uncertainties are standard, k = 1. Those of the coefficients are strongly "
-            "correlated; the calibration file has the whole covariance.",
-        ),
-        Section(
-            "Static gain and background",
-            (),
-            (tables.gain_table(calibration), tables.background_table(certificate)),
-        ),
-        _model_errors(certificate),
-        Section(
-            "Records",
-            (),
-            (
-                identity,
-                mapping_table("Settings calibrated for", calibration.settings),
-                mapping_table("Further entries", further),
-            ),
-        ),
-    ]
+        *(Section(title, shown, tuple(make(calibration) for make in made), note)
+          for title, shown, made, note in _SECTIONS),
+        Section("Records", (), records),
+    ]  # fmt: skip
     return present(every, issue.figures)
 
 

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from omsm_ros.core.calibration.calibration import SCHEMA, Calibration
-from omsm_ros.core.calibration.certificate import Certificate
 from omsm_ros.core.lti.frequency_response import low_frequency_delay_uncertainty, response_band
 from omsm_ros.core.lti.modes import KnownMode, known_modes
 from omsm_ros.core.lti.transfer_function import Structure
@@ -50,8 +49,9 @@ def structure_text(structure: Structure) -> str:
     return ", ".join([*parts, "delay" if structure.delay else "no delay"])
 
 
-def residual_table(certificate: Certificate) -> Table:
+def residual_table(calibration: Calibration) -> Table:
     """Return the tests of the residual."""
+    certificate = calibration.certificate
     found = certificate.residual
     rows = [
         ("χ² where the axis moves", plain(found.chi_square), "1 if only noise is left"),
@@ -90,8 +90,9 @@ def _in_words(p: float | None, good: str, bad: str) -> str:
     return "" if p is None else bad if p < _SIGNIFICANT else good
 
 
-def order_table(certificate: Certificate) -> Table:
+def order_table(calibration: Calibration) -> Table:
     """Return every structure that was tried."""
+    certificate = calibration.certificate
     candidates = sorted(certificate.candidates, key=lambda c: structure_text(c.structure))
     least = min((c.bic for c in candidates), default=0.0)
     rows = []
@@ -126,8 +127,9 @@ def _gain_row(name: str, value: float, spread: float | None) -> tuple[str, ...]:
 _POLARITIES = {1: "falls when Z rises", -1: "rises when Z rises"}
 
 
-def background_table(certificate: Certificate) -> Table:
+def background_table(calibration: Calibration) -> Table:
     """Return what the readings contain besides the motion."""
+    certificate = calibration.certificate
     errors, response = certificate.model_errors, certificate.response
     polarity = certificate.static_gain.polarity
     rows = [
@@ -147,9 +149,9 @@ def _or_none(value: float | None, unit: str) -> str:
     return "none found" if value == 0 else quantity(value, unit)
 
 
-def model_error_table(certificate: Certificate) -> Table:
+def model_error_table(calibration: Calibration) -> Table:
     """Return the deviations from a linear, steady response that were modelled."""
-    found = certificate.model_errors
+    found = calibration.certificate.model_errors
     rows = [
         (
             error.family,
@@ -164,7 +166,7 @@ def model_error_table(certificate: Certificate) -> Table:
     return Table("Found in addition to a linear, steady response", ("size", "u", "modelled"), rows)
 
 
-def consistency_table(certificate: Certificate) -> Table:
+def consistency_table(calibration: Calibration) -> Table:
     """Return the differences between the parts of the test, the first less the second."""
     rows = [
         (
@@ -173,7 +175,7 @@ def consistency_table(certificate: Certificate) -> Table:
             measured(_ppm(part.gain_difference), _ppm(part.gain_difference_uncertainty)),
             probability(part.p),
         )
-        for part in certificate.consistency
+        for part in calibration.certificate.consistency
     ]
     columns = ("lag differs by", "gain differs by [ppm]", "p, by chance")
     return Table("Agreement of the parts of the test", columns, rows)
@@ -225,8 +227,9 @@ def limit_rows(limits: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def limit_table(certificate: Certificate) -> Table:
+def limit_table(calibration: Calibration) -> Table:
     """Return what the verdict was measured against."""
+    certificate = calibration.certificate
     rows, use = limit_rows(certificate.limits), certificate.validity.use
     rows.append(("motion taken from", certificate.origin.input or NOTHING))
     if use is not None:
@@ -294,9 +297,9 @@ _UNITS_PER_MASS = {
 _PROBE_ON = {False: "second mass, not the driven one (Eq. 7)", True: "driven mass (collocated)"}
 
 
-def two_mass_table(certificate: Certificate) -> Table:
+def two_mass_table(calibration: Calibration) -> Table:
     """Return masses, springs and dampers, or each per mass of the table where that is not known."""
-    found, title = certificate.response.two_mass, "Two-mass model (Eq. 6, 7)"
+    title, found = "Two-mass model (Eq. 6, 7)", calibration.certificate.response.two_mass
     if found is None:
         return Table(title, (), [])
     absolute = found.table_mass_kg is not None
@@ -335,9 +338,9 @@ def shape_table(calibration: Calibration) -> Table:
     return Table("Shape of the response", ("", "within the valid range"), rows)
 
 
-def undetected_table(certificate: Certificate) -> Table:
+def undetected_table(calibration: Calibration) -> Table:
     """Return the model errors that this test could not detect, and what they cost on a scan."""
-    found = certificate.undetected
+    found = calibration.certificate.undetected
     rows = []
     for term in found.terms:
         family, size = term.family, quantity(term.missed, "m")
