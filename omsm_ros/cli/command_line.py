@@ -153,7 +153,6 @@ def check_outputs(args: argparse.Namespace) -> None:
 
 
 def _paths(value: object) -> Iterator[Path]:
-    """Yield the paths in the value of an argument."""
     if isinstance(value, list | tuple):
         for one in value:
             yield from _paths(one)
@@ -204,7 +203,6 @@ omsm: on-machine surface measurement, corrected for the dynamic error of machine
 
 
 def _by_task() -> str:
-    """Return the commands with their help, grouped by task."""
     lines = []
     for task, words in TASKS.items():
         lines += ["", f"{task}:"]
@@ -330,7 +328,6 @@ def _make_writable() -> None:
 
 
 def _report_internal_error(err: Exception) -> int:
-    """Print an unexpected error; return the exit status."""
     known = too_many_open_files(err)
     if isinstance(err, FileNotFoundError) and err.filename is None:  # of os.getcwd
         known = "the folder in which this command runs was deleted; change to one that exists"

@@ -67,7 +67,6 @@ def export(
 
 
 def _records(points: MeasuredPoints) -> NDArray[np.void]:
-    """Return the columns that every format has."""
     columns: dict[str, NDArray[Any]] = {"x": points.x, "y": points.y, "z": points.height}
     if points.uncertainty is not None:
         columns["uncertainty"] = points.uncertainty

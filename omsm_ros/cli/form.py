@@ -175,7 +175,6 @@ def _program(
 
 
 def _warnings(sure: float, before: float, after: float) -> list[str]:
-    """Return warnings against the cut."""
     found = []
     if sure < _LEAST_SIGNIFICANT_SHARE:
         found.append(

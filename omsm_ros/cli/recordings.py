@@ -131,7 +131,6 @@ def _show_inspect(facts: Facts) -> Rows:
 
 
 def _vibration_rows(found: Facts | None) -> Rows:
-    """Return rows of the largest levels by band, as the vibration monitor reported them."""
     if found is None:
         return []
     rows = []

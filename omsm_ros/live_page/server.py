@@ -11,8 +11,6 @@ from importlib import resources
 from typing import Any
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
-import matplotlib
-import numpy as np
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
@@ -22,7 +20,7 @@ from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import json_and_yaml
 from omsm_ros.live_page.live_view import LiveView
 from omsm_ros.report import style
-from omsm_ros.report.measurement.surface_map import policy_of, script
+from omsm_ros.report.measurement.surface_map import palette, policy_of, script
 from omsm_ros.report.page_parts import fill
 
 # Time-out of ``accept``, so that closing the port is noticed, and the pause if the process may
@@ -258,13 +256,8 @@ def _serve(server: Server) -> None:
             server.shutdown_watcher.close()
 
 
-_COLOURS = 128
-
-
 def render(title: str) -> str:
     """Return the page as HTML in one file; it opens a socket to its own origin."""
-    colours = matplotlib.colormaps[style.MAP_COLOURS](np.linspace(0, 1, _COLOURS))[:, :3]
-    palette = "".join(f"{round(255 * part):02x}" for row in colours for part in row)
     folder = resources.files("omsm_ros.report") / "templates"
     drawing = script() + (folder / "live.js").read_text(encoding="utf-8")
     return fill(
@@ -272,6 +265,6 @@ def render(title: str) -> str:
         title=title,
         script=drawing,
         script_policy=policy_of(drawing),
-        palette=palette,
+        palette=palette(),
         missing=style.MISSING.lstrip("#"),
     )

@@ -15,6 +15,7 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.machine_sources import MachineSources, StatedSource
 from omsm_ros.core.correction.surface_points import CLOUD_FIELDS
 from omsm_ros.core.correction.systematic import EVALUATED
+from omsm_ros.core.surface.deviation import level
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import OmsmError, printable
 from omsm_ros.instruments.emulator_factory import emulated
@@ -288,14 +289,10 @@ def form_truth(part: FigureError, found: Adjustment) -> dict[str, float]:
     """Return the true PV and rms of the part, pose removed, and the error of the map (rms)."""
     form = found.form
     error = part.deviation(form.x, form.y)
-    columns = np.stack([np.ones_like(form.x), form.x, form.y], axis=1)
-    weight = np.sqrt(form.area)[:, np.newaxis]
-
-    def levelled(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        pose = np.linalg.lstsq(columns * weight, values * weight[:, 0], rcond=None)[0]
-        return np.asarray(values - columns @ pose)
-
-    true, off = levelled(error), levelled(form.height - error)
+    true, off = (
+        level(form.x, form.y, values, tilt=True, weights=form.area)
+        for values in (error, form.height - error)
+    )
     return {
         "peak_to_valley": float(np.ptp(true)),
         "rms": float(np.sqrt(form.area @ true**2)),

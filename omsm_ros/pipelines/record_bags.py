@@ -179,6 +179,5 @@ def write_nominal(path: Path, whole: bool = False) -> None:
 
 
 def _write(path: Path, recording: Recording) -> int:
-    """Write a recording as a bag; return its number of samples."""
     write_recording(path, recording)
     return len(recording.axes)

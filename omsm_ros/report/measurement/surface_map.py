@@ -152,15 +152,20 @@ class EmbeddedMap:
 
 def embedded(layers: Sequence[Layer]) -> EmbeddedMap:
     """Return maps for a page, each of at most 400 × 400 pixels."""
-    colours = matplotlib.colormaps[style.MAP_COLOURS](np.linspace(0, 1, _COLOURS))[:, :3]
     content = {
-        "colours": "".join(f"{round(255 * part):02x}" for row in colours for part in row),
+        "colours": palette(),
         "missing": style.MISSING.lstrip("#"),
         "layers": [_entry(layer) for layer in layers],
     }
     # A name with "<" could end the script element.
     data = json.dumps(content, separators=(",", ":")).replace("<", r"\u003c")
     return EmbeddedMap(data, tuple(layer.name for layer in layers))
+
+
+def palette() -> str:
+    """Return the colours of maps, least to largest, each as six hexadecimal digits."""
+    colours = matplotlib.colormaps[style.MAP_COLOURS](np.linspace(0, 1, _COLOURS))[:, :3]
+    return "".join(f"{round(255 * part):02x}" for row in colours for part in row)
 
 
 def script() -> str:
