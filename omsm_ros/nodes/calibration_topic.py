@@ -57,6 +57,11 @@ class CalibrationTopic:
                 node, undo, CalibrationMessage, TOPIC, self._on_message, topics.LATCHED_BY_MANY_QOS
             )
 
+    @property
+    def id(self) -> str:
+        """Return the id of the calibration in force; empty before the first one."""
+        return self.calibration.id if self.calibration else ""
+
     def decided(self) -> int:
         """Return the stamp of a calibration put in force now: later than all before [ns]."""
         return max(self._now_ns(), self.since_ns + 1)

@@ -245,9 +245,8 @@ class CalibratorNode(ManagedNode):
 
     def report(self) -> StateReport:
         """Return the samples held, the calibration in force, and the blocks refused."""
-        in_force = self._topic.calibration
         values: dict[str, object] = {
-            "calibration": in_force.id if in_force else "",
+            "calibration": self._topic.id,
             "requests_waiting": self._worker.waiting,
             "blocks_refused": sum(self._refused.values()),
         }

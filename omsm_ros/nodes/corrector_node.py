@@ -321,7 +321,7 @@ class CorrectorNode(ManagedNode):
     async def _on_load(
         self, request: LoadCalibration.Request, response: LoadCalibration.Response
     ) -> None:
-        response.id = self._in_force_id()
+        response.id = self._topic.id
         if not request.path:
             raise CalibrationError("no path is given; name a file of a calibration, CAL.json")
         folders = self.values["calibration_folders"]
@@ -329,11 +329,7 @@ class CorrectorNode(ManagedNode):
         calibration = await self._worker.do(partial(load_for_others, path))
         self._put_in_force(calibration, self._topic.decided())
         response.success, response.message = True, "in use"
-        response.id = self._in_force_id()
-
-    def _in_force_id(self) -> str:
-        calibration = self._topic.calibration
-        return calibration.id if calibration else ""
+        response.id = self._topic.id
 
     async def _on_predict(self, request: Any, response: Any, goal: Goal | None = None) -> None:
         # Without a prediction the error is not zero but unknown.
@@ -421,7 +417,7 @@ class CorrectorNode(ManagedNode):
         now, cpu = time.monotonic(), time.process_time()
         now_ns = self.get_clock().now().nanoseconds
         report = self._state.report(self._corrector, now, cpu, self._motion)
-        report.values["calibration"] = self._in_force_id()
+        report.values["calibration"] = self._topic.id
         # Without a point there is nothing to assess.
         if self._state.published and self._corrector and self._topic.calibration is not None:
             used, accuracy = self._topic.calibration, accuracy_of(self.values)

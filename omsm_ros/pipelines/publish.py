@@ -41,15 +41,9 @@ def view_of(cloud: NDArray[np.void], sample_period: float) -> CloudView | None:
     if not len(cloud):
         return None
     sample = cloud["sample"].astype(np.int64)
-    error = cloud["dynamic_error"].astype(np.float64)
-    return CloudView(
-        time=(sample - sample[0]) * sample_period,
-        x=cloud["x"].astype(np.float64),
-        y=cloud["y"].astype(np.float64),
-        height=cloud["height"].astype(np.float64),
-        dynamic_error=error,
-        uncertainty=cloud["uncertainty"].astype(np.float64),
-    )
+    names = ("x", "y", "height", "dynamic_error", "uncertainty")
+    columns = {name: cloud[name].astype(np.float64) for name in names}
+    return CloudView(time=(sample - sample[0]) * sample_period, **columns)
 
 
 def map_of(view: CloudView | None, nominal: Surface | None, out: Path) -> EmbeddedMap | None:
