@@ -101,12 +101,11 @@ def calibration_of(content: dict[str, Any], what: str) -> Calibration:
     is_set = content.get("schema") in (SET_SCHEMA, SET_SCHEMA_1)
     check_form(content, _SET_FORM if is_set else _FORM, CalibrationError, what)
     with named_errors(CalibrationError, what, CalibrationError):
-        return _set_of(content) if is_set else _calibration_of(content)
-
-
-def _calibration_of(content: dict[str, Any]) -> Calibration:
-    stored = _check_id(content)
-    return calibration_from(content, stored)
+        stored = _check_id(content)
+        if not is_set:
+            return calibration_from(content, stored)
+        own = [dict(member["calibration"]) for member in content["members"]]
+        return set_from_content(content, [calibration_from(c, _check_id(c)) for c in own])
 
 
 def calibration_from(content: dict[str, Any], stored: str) -> Calibration:
@@ -121,12 +120,6 @@ def calibration_from(content: dict[str, Any], stored: str) -> Calibration:
     certificate = calibration.certificate
     origin = replace(certificate.origin, made_from=stored)
     return replace(calibration, certificate=replace(certificate, origin=origin))
-
-
-def _set_of(content: dict[str, Any]) -> Calibration:
-    _check_id(content)
-    members = [_calibration_of(dict(member["calibration"])) for member in content["members"]]
-    return set_from_content(content, members)
 
 
 def _check_id(content: dict[str, Any]) -> str:

@@ -264,15 +264,6 @@ def _record(node: DemoNode, processes: NodeProcesses, plan: Demonstration, bag: 
     )
 
 
-def _until_seen() -> None:
-    """Keep the live page until Enter is pressed, or without a terminal until it is drawn."""
-    if sys.stdin.isatty() and sys.stderr.isatty():
-        print("the live page stays until you press Enter ", end="", file=sys.stderr, flush=True)
-        sys.stdin.readline()
-    else:
-        time.sleep(_DRAWING_S)
-
-
 def _start(node: DemoNode, processes: NodeProcesses, plan: Demonstration) -> None:
     processes.start("cell_emulator", link=plan.link, **plan.emulator_parameters())
     processes.start("confocal_driver", **plan.driver_parameters())
@@ -377,7 +368,12 @@ def main() -> None:
                 summary = finish_demonstration(plan)
             if plan.view:
                 node.show(headline(summary["adjustment"]), summary["adjustment"]["verdict"])
-                _until_seen()
+                if sys.stdin.isatty() and sys.stderr.isatty():
+                    text = "the live page stays until you press Enter "
+                    print(text, end="", file=sys.stderr, flush=True)
+                    sys.stdin.readline()
+                else:
+                    time.sleep(_DRAWING_S)  # until the page is drawn
     except OmsmError as err:
         print(f"omsm demo: {one_line(err)}", file=sys.stderr)
         sys.exit(2)

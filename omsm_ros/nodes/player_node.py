@@ -326,8 +326,8 @@ class PlayerNode(ManagedNode):
 
     def _begin(self) -> None:
         self._playback = Playback(self._span[0], self.values["rate"])
-        self._messages = self._in_order()
-        self._next = next(self._messages, None)
+        self._recorded = self._in_order()
+        self._next = next(self._recorded, None)
 
     def _in_order(self) -> Iterator[tuple[str, int, bytes]]:
         begin, end = self._span
@@ -397,7 +397,7 @@ class PlayerNode(ManagedNode):
         self._offers[topic].publish(cdr)
         self._listeners.published(self._offers[topic].topic_name, len(cdr))
         self._counts[topic] += 1
-        self._next = next(self._messages, None)
+        self._next = next(self._recorded, None)
 
     def _tell_time(self, now: float) -> None:
         if self._time is None:

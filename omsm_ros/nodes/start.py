@@ -126,15 +126,9 @@ def set_up_fast_dds() -> None:
         os.environ[_PROFILES[second]] = str(Path(__file__).with_name(profile))
         if not os.environ.get(_PUBLICATION_MODE):
             os.environ.setdefault(_MORE_FROM_PROFILE, "1")
-    _send_from_own_thread()
-
-
-def _send_from_own_thread() -> None:
-    """Let Fast DDS send from its own thread, so that a blocked subscriber blocks no publisher.
-
-    A publisher would wait for it for a second or more; after 0.1 s Fast DDS drops the message, and
-    later ones reach that subscriber only when its queue has overflowed.
-    """
+    # From its own thread, so that a blocked subscriber blocks no publisher: it would wait for a
+    # second or more; after 0.1 s Fast DDS drops the message, and later ones reach that subscriber
+    # only when its queue has overflowed.
     os.environ.setdefault(_PUBLICATION_MODE, "ASYNCHRONOUS")
 
 
