@@ -4,8 +4,8 @@ Columns may have any units: each is scaled to unit length first.
 """
 
 import threading
-from collections.abc import Callable
-from contextlib import ContextDecorator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -84,40 +84,33 @@ def without_copy(places: NDArray[np.int64]) -> slice | NDArray[np.int64]:
     return slice(int(places[0]), int(places[-1]) + 1) if whole else places
 
 
-class _OneThread(ContextDecorator):
-    """The limit of BLAS to one thread, shared by all that ask for it at the same time."""
-
-    def __init__(self) -> None:
-        self._lock, self._users = threading.Lock(), 0
-        self._limit: Any = None
-
-    def __enter__(self) -> None:
-        try:
-            from threadpoolctl import threadpool_limits
-        except ImportError:  # nodes and commands ask BLAS for one thread as they start
-            threadpool_limits = None
-        with self._lock:
-            if self._users == 0 and threadpool_limits is not None:
-                self._limit = threadpool_limits(1, user_api="blas")
-            self._users += 1
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._users -= 1
-            if self._users == 0 and self._limit is not None:
-                self._limit.restore_original_limits()
+# The limit of BLAS to one thread, shared by all that ask for it at the same time.
+_lock, _users, _limit = threading.Lock(), 0, None
 
 
-_one_thread = _OneThread()
-
-
-def one_blas_thread() -> ContextDecorator:
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
     """Let BLAS compute in one thread; also a decorator.
 
     The order of additions in a sum depends on the number of threads, so that a search would end at
     other bits, or at another model. Threads cost more than they gain in matrices of this size.
     """
-    return _one_thread
+    global _users, _limit
+    try:
+        from threadpoolctl import threadpool_limits
+    except ImportError:  # nodes and commands ask BLAS for one thread as they start
+        threadpool_limits = None
+    with _lock:
+        if _users == 0 and threadpool_limits is not None:
+            _limit = threadpool_limits(1, user_api="blas")
+        _users += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _users -= 1
+            if _users == 0 and _limit is not None:
+                _limit.restore_original_limits()
 
 
 @cache  # made when it is needed: every command loads this module, and scipy.signal takes longer

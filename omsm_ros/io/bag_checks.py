@@ -7,8 +7,8 @@ may unpack to gigabytes.
 from __future__ import annotations
 
 from binascii import crc32
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from functools import lru_cache
 from itertools import accumulate
 from os import SEEK_END, fstat
@@ -230,23 +230,20 @@ def _bounded(decompress: Callable[..., bytes], data: bytes, size: int, exactly: 
     return raw
 
 
-class _Unpacked:
-    def __init__(self, packed: IO[bytes], mode: str) -> None:
-        self._path, self._size = Path(packed.name), fstat(packed.fileno()).st_size
-        self._stream, self._read = storage_mcap.zstd.open(packed, mode), 0
+@contextmanager
+def _open_unpacked(packed: IO[bytes], mode: str) -> Iterator[Any]:
+    """Open a compressed file; its ``read`` raises BagError where there are too many bytes."""
+    size, total = fstat(packed.fileno()).st_size, 0
 
-    def __enter__(self) -> _Unpacked:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stream.close()
-
-    def read(self, size: int) -> bytes:
-        """Return the next bytes; BagError if there are too many."""
-        part: bytes = self._stream.read(size)
-        self._read += len(part)
-        check_unpacked(self._path, self._size, self._read)
+    def read(wanted: int) -> bytes:
+        nonlocal total
+        part: bytes = stream.read(wanted)
+        total += len(part)
+        check_unpacked(Path(packed.name), size, total)
         return part
+
+    with storage_mcap.zstd.open(packed, mode) as stream:
+        yield SimpleNamespace(read=read)
 
 
 def _check_tables(base: Any) -> None:
@@ -263,7 +260,7 @@ storage_mcap.DECOMPRESSORS |= {
     "zstd": _zstd,
     "lz4": lambda data, size: _bounded(LZ4FrameDecompressor().decompress, data, size, True),
 }
-bag_folder.zstd = SimpleNamespace(open=_Unpacked, decompress=unpacked_message)
+bag_folder.zstd = SimpleNamespace(open=_open_unpacked, decompress=unpacked_message)
 # A few bytes of nested aliases become gigabytes when an error message shows them.
 for _module in (bag_folder, storage_mcap, storage_sqlite3):
     _module.parse_qos = _plain_qos
