@@ -269,16 +269,6 @@ def _show_experiment(facts: Facts) -> Rows:
     return [written(["report.html"], facts["out"])]
 
 
-def _demo(args: argparse.Namespace) -> int:
-    # The demonstration is a node itself, so that only its process imports ROS.
-    command = [sys.executable, "-m", "omsm_ros.nodes.start", "cell_demo", "--out", str(args.out)]
-    command += ["--device", args.device, "--seed", str(args.seed)]
-    command += ["--time-lapse", str(args.time_lapse)] if args.time_lapse else []
-    command += ["--disturbances", args.disturbances] if args.disturbances else []
-    command += ["--view"] if args.view else []
-    return subprocess.call([*command, *(["--json"] if args.json else [])])
-
-
 @written_for(COMMAND)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
@@ -294,7 +284,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise UsageError(f"{own[0]!r}: unknown command, did you mean {near[0]!r}?")
         args = parser_of(named).parse_args(own)
         args.passed_on = passed_on
-        return _run(args)
+        return _run(args, own)
     except OmsmError as err:
         warn(too_many_open_files(err) or str(err))
         return BAD_INPUT
@@ -355,10 +345,12 @@ def _split(given: list[str]) -> tuple[list[str], list[str]]:
     return given[:place], given[place + 1 :]
 
 
-def _run(args: argparse.Namespace) -> int:
+def _run(args: argparse.Namespace, given: list[str]) -> int:
     check_outputs(args)
     if args.command == DEMO and not args.experiment:
-        return _demo(args)
+        # The demonstration is a node itself, so that only its process imports ROS.
+        command = [sys.executable, "-m", "omsm_ros.nodes.start", "cell_demo"]
+        return subprocess.call([*command, *given[given.index(DEMO) + 1 :]])
     with interrupt_on_signal(), progress_in_background(f"omsm {args.command}", args.json):
         facts = args.run.act(args)
     _tell(args, facts)

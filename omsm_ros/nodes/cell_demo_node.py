@@ -335,7 +335,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--device", choices=sorted(EMULATED), default="six_channel")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--start-radius", type=float, help="[m]")
-    parser.add_argument("--disturbances", type=Path, help="errors of the simulated machine")
+    parser.add_argument(
+        "--disturbances", type=Path, dest="disturbance_file", help="errors of the simulated machine"
+    )
     parser.add_argument("--view", action="store_true", help="show the scan in a browser")
     parser.add_argument("--json", action="store_true")
     # With `ros2 run`, the arguments after --ros-args are for rclpy.
@@ -344,20 +346,13 @@ def _arguments() -> argparse.Namespace:
 
 def main() -> None:
     """Run ``ros2 run omsm_ros cell_demo``."""
-    args = _arguments()
+    options = vars(_arguments())
+    as_json: bool = options.pop("json")
     # A demonstration is isolated from other nodes on the network.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-    plan = Demonstration(
-        args.out,
-        seed=args.seed,
-        time_lapse=args.time_lapse,
-        start_radius=args.start_radius,
-        device=args.device,
-        disturbance_file=args.disturbances,
-        view=args.view,
-    )
-    stage = partial(demo_stage, quiet=args.json)
+    plan = Demonstration(**options)
+    stage = partial(demo_stage, quiet=as_json)
     try:
         rclpy.init()
         plan.prepare()
@@ -388,4 +383,4 @@ def main() -> None:
         sys.exit(130)
     finally:
         rclpy.try_shutdown()
-    print(json.dumps(summary) if args.json else table_of(plan, summary))
+    print(json.dumps(summary) if as_json else table_of(plan, summary))

@@ -199,26 +199,21 @@ def test_the_twin_is_made_as_its_options_say(capsys, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "passed_on"),
+    "given",
     [
-        ([], ["--device", "six_channel", "--seed", "1"]),
-        (["--device", "capancdt", "--seed", "5"], ["--device", "capancdt", "--seed", "5"]),
-        (["--time-lapse", "4"], ["--time-lapse", "4.0"]),
-        (["--disturbances", "bad.yaml"], ["--disturbances", "bad.yaml"]),
-        (["--view", "--json"], ["--view", "--json"]),
+        [],
+        ["--device", "capancdt", "--seed", "5"],
+        ["--time-lapse", "4"],
+        ["--disturbances", "demo"],
+        ["--view", "--json"],
     ],
 )
-def test_the_demonstration_gets_the_requested_options(monkeypatch, tmp_path, given, passed_on):
+def test_the_demonstration_gets_the_requested_options(monkeypatch, tmp_path, given):
     called = []
     monkeypatch.setattr(command_line.subprocess, "call", lambda words: called.append(words) or 7)
     assert cli.main(["demo", "--out", str(tmp_path), *given]) == 7
     (words,) = called
-    assert words[1:4] == ["-m", "omsm_ros.nodes.start", "cell_demo"]
-    text = " ".join(words)
-    assert f"--out {tmp_path}" in text
-    assert " ".join(passed_on) in text
-    if not given:
-        assert not {"--view", "--json", "--time-lapse", "--disturbances"} & set(words)
+    assert words[1:] == ["-m", "omsm_ros.nodes.start", "cell_demo", "--out", str(tmp_path), *given]
 
 
 @pytest.mark.parametrize("address", ["nowhere", "http://a:1", "tcp://a"])
