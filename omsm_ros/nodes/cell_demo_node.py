@@ -335,9 +335,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--device", choices=sorted(EMULATED), default="six_channel")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--start-radius", type=float, help="[m]")
-    parser.add_argument(
-        "--disturbances", type=Path, dest="disturbance_file", help="errors of the simulated machine"
-    )
+    parser.add_argument("--disturbances", type=Path, dest="disturbance_file",
+                        metavar="DISTURBANCES", help="errors of the simulated machine")  # fmt: skip
     parser.add_argument("--view", action="store_true", help="show the scan in a browser")
     parser.add_argument("--json", action="store_true")
     # With `ros2 run`, the arguments after --ros-args are for rclpy.
