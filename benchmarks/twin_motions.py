@@ -28,9 +28,10 @@ def respond(
 ) -> Response:
     """Return the response of the plant to ``motion`` every ``sample_period`` [s]."""
     lead = int(np.ceil(plant.lead_in() / sample_period))
-    moved = move(plant, motion, TimeGrid(lead, samples, sample_period, substeps, substeps))
+    grid = TimeGrid(lead, samples, sample_period, substeps, substeps)
+    slide, probe = move(plant, motion, grid)
     at_samples = slice(lead - 1, lead - 1 + samples)
-    return Response(moved.slide.values[at_samples], moved.probe.values[at_samples])
+    return Response(slide.values[at_samples], probe.values[at_samples])
 
 
 def step_test_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:

@@ -173,10 +173,10 @@ def scene_of(
 ) -> Scene:
     """Simulate ``motion`` and return the scene; ``random``: generators by the name of their use."""
     times = np.arange(-grid.lead, grid.samples + 1, dtype=np.float64) * grid.sample_period
-    moved = move(plant, motion, grid)
+    slide, probe = move(plant, motion, grid)
     if not is_default(disturbances.structure):
         slide_x = Trajectory(times[0], grid.sample_period, motion.positions(times).x)
-        moved = deform(disturbances.structure, moved, slide_x)
+        probe = deform(disturbances.structure, (slide, probe), slide_x)
     if spot := disturbances.probe.spot_m:
         surface = UnderSpot(surface, spot)
     return Scene(
@@ -184,8 +184,8 @@ def scene_of(
         motion=motion,
         surface=mounted_surface(surface, disturbances.machine.pose),
         stand_off=stand_off,
-        slide=moved.slide,
-        probe=moved.probe,
+        slide=slide,
+        probe=probe,
         shifting=tuple(_shifting(disturbances, times, random)),
         vibration=with_phases(disturbances.vibration, random["vibration"]),
     )

@@ -103,14 +103,6 @@ class Plant(CheckedRecord):
         return float(_LEAD_IN_TIME_CONSTANTS / slowest + self.dynamics.delay)
 
 
-@dataclass(frozen=True, eq=False)
-class Movement:
-    """True motion of slide and probe as signals in time [m]."""
-
-    slide: Trajectory
-    probe: Trajectory
-
-
 @dataclass(frozen=True, slots=True)
 class TimeGrid:
     """Time steps of the simulation.
@@ -131,8 +123,8 @@ class TimeGrid:
         return self.sample_period / self.substeps
 
 
-def move(plant: Plant, motion: Motion, grid: TimeGrid) -> Movement:
-    """Return the response of the plant to ``motion``, from ``grid.lead`` periods before time 0.
+def move(plant: Plant, motion: Motion, grid: TimeGrid) -> tuple[Trajectory, Trajectory]:
+    """Return the motion of slide and probe [m], from ``grid.lead`` periods before time 0.
 
     In each substep the command is held at its value in the middle, which is exact for a step on the
     grid and of second order for a smooth motion. The delay shifts the time of the command; a step
@@ -143,7 +135,7 @@ def move(plant: Plant, motion: Motion, grid: TimeGrid) -> Movement:
         np.asarray(multiply(servo.numerator, plant.dynamics.numerator), np.float64),
         np.asarray(multiply(servo.denominator, plant.dynamics.denominator), np.float64),
     )
-    return Movement(
+    return (
         _through_system(servo, 0.0, motion, grid),
         _through_system(both, plant.dynamics.delay, motion, grid),
     )

@@ -18,8 +18,8 @@ from omsm_ros.core.model_errors.families import dahl_friction, through_backlash
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import LENGTH, CheckedRecord
-from omsm_ros.twin.plant import Movement, Trajectory
-from omsm_ros.twin.record_checks import ANY, DAMPING, DURATION, FREQUENCY, SIZE, WIDTH, is_default
+from omsm_ros.twin.plant import Trajectory
+from omsm_ros.twin.record_checks import ANY, DAMPING, DURATION, FREQUENCY, SIZE, WIDTH
 
 # Time in which the motion is faded in, so that it does not excite a soft mode.
 _SPIN_UP_S = 4.0
@@ -164,17 +164,18 @@ class StructureErrors(CheckedRecord):
         return result
 
 
-def deform(errors: StructureErrors, moved: Movement, slide_x: Trajectory) -> Movement:
-    """Return the motion ``moved`` with the ``errors`` of the structure.
+def deform(
+    errors: StructureErrors, moved: tuple[Trajectory, Trajectory], slide_x: Trajectory
+) -> Trajectory:
+    """Return the motion of the probe with the ``errors`` of the structure.
 
+    moved: slide and probe without them [m]
     slide_x: position of X [m], on any grid that covers ``moved``
     """
-    if is_default(errors):
-        return moved
-    slide, probe = moved.slide.values, moved.probe.values
-    probe = probe + _slow_parts(errors, moved.probe)
+    slide, driven = moved[0].values, moved[1]
+    probe = driven.values + _slow_parts(errors, driven)
     if errors.compliance_per_m_of_z or errors.compliance_per_m_of_x:
-        x = np.interp(moved.probe.times, slide_x.times, slide_x.values)
+        x = np.interp(driven.times, slide_x.times, slide_x.values)
         along = errors.compliance_per_m_of_z * slide + errors.compliance_per_m_of_x * x
         probe = slide - (slide - probe) * (1 + along)
     if errors.hardening_deflection_m is not None:
@@ -183,10 +184,8 @@ def deform(errors: StructureErrors, moved: Movement, slide_x: Trajectory) -> Mov
         probe = (
             probe - errors.friction.drag_m * dahl_friction(probe, errors.friction.presliding_m)[0]
         )
-    result = Trajectory(moved.probe.start, moved.probe.step, probe)
-    if errors.backlash_m:
-        result = backlash(result, errors.backlash_m)
-    return Movement(moved.slide, result)
+    result = Trajectory(driven.start, driven.step, probe)
+    return backlash(result, errors.backlash_m) if errors.backlash_m else result
 
 
 def _slow_parts(errors: StructureErrors, probe: Trajectory) -> FloatArray:

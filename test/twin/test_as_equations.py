@@ -11,7 +11,7 @@ from omsm_ros.core.model_errors.families import dahl_friction
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.disturbances import VibrationLine
 from omsm_ros.twin.part import AzimuthalRipple, PartPose
-from omsm_ros.twin.plant import PAPER_DYNAMICS, Movement, Plant, TimeGrid, Trajectory, move
+from omsm_ros.twin.plant import PAPER_DYNAMICS, Plant, TimeGrid, Trajectory, move
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.record_checks import is_default
 from omsm_ros.twin.sensors import (
@@ -93,9 +93,8 @@ def test_what_creeps_and_swings_obeys_its_equations():
     p = probe.values[after]
     expected = p + 0.01 * (c - p) + 5e-3 * (m - p)
     errors = StructureErrors(creep=(creep,), soft_modes=(mode,))
-    moved = deform(errors, Movement(probe, probe), probe)
-    np.testing.assert_allclose(moved.probe.values[after], expected, atol=1e-12)
-    assert moved.slide is probe
+    moved = deform(errors, (probe, probe), probe)
+    np.testing.assert_allclose(moved.values[after], expected, atol=1e-12)
 
 
 def test_friction_obeys_dahl_s_law_in_time():
@@ -300,12 +299,12 @@ def test_a_record_is_its_default_until_something_is_set():
 def test_what_is_kept_of_the_simulation_lies_where_it_says():
     """Each kept value at its own time, however fine the steps are and whichever are kept."""
     grid = TimeGrid(lead=50, samples=200, sample_period=STEP, substeps=16, every=8)
-    moved = move(Plant(), Swing(), grid)
+    slide, probe = move(Plant(), Swing(), grid)
     coarse = respond(Plant(), Swing(), 200, STEP)
-    times = moved.slide.times
+    times = slide.times
     assert times[0] == pytest.approx(-50 * STEP + STEP / 2)
     np.testing.assert_allclose(np.diff(times), STEP / 2)
     at = np.arange(1, 200) * STEP
-    np.testing.assert_allclose(moved.slide.at(at), coarse.slide[1:], atol=1e-16)
-    np.testing.assert_allclose(moved.probe.at(at), coarse.probe[1:], atol=1e-16)
+    np.testing.assert_allclose(slide.at(at), coarse.slide[1:], atol=1e-16)
+    np.testing.assert_allclose(probe.at(at), coarse.probe[1:], atol=1e-16)
     assert PAPER_DYNAMICS.dc_gain == pytest.approx(1.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.plant import Movement, Trajectory
+from omsm_ros.twin.plant import Trajectory
 from omsm_ros.twin.structure import (
     Creep,
     Friction,
@@ -24,7 +24,7 @@ def _deformed(errors, slide, probe=None, start=-10.0):
     """Motion of the probe where the clean one would be ``probe``, by default the carriage's."""
     made = [Trajectory(start, STEP_S, z) for z in (slide, slide if probe is None else probe)]
     slide_x = Trajectory(start, 1.0, np.arange(60) * 1e-4)
-    return deform(errors, Movement(*made), slide_x).probe.values
+    return deform(errors, tuple(made), slide_x).values
 
 
 def _times(duration=30.0, start=-10.0):

@@ -76,11 +76,7 @@ def _certificate(calibration: Calibration, polarity: int | None) -> list[Notice]
         found.append(Notice("calibration.was_rejected", reasons=f" ({reasons})" if reasons else ""))
     certified = certificate.static_gain.polarity
     if polarity is not None and certified is not None and certified != polarity:
-        code = (
-            "calibration.other_polarity_rises"
-            if certified == -1
-            else ("calibration.other_polarity_falls")
-        )
+        code = f"calibration.other_polarity_{'rises' if certified == -1 else 'falls'}"
         found.append(Notice(code, polarity=polarity, certified=certified))
     return found
 

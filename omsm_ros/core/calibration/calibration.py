@@ -342,7 +342,12 @@ def certificate_of_version_1(entries: Mapping[str, Any]) -> Certificate:
         content["limits"] = dict(limits)
         band = {name: limits[name] for name in ("gain", "phase_rad") if name in limits}
         content["validity"] = content.get("validity", {}) | band
-    _add_candidates(content, entries.get("candidates"))
+    candidates, names = entries.get("candidates"), ("poles", "zeros", "delay")
+    content["candidates"] = [
+        {"structure": {n: c[n] for n in names}, "bic": c["bic"], "rms_m": c["rms_m"]}
+        for c in (candidates if isinstance(candidates, list) else ())
+        if isinstance(c, Mapping) and {*names, "bic", "rms_m"} <= c.keys()
+    ]
     for name, gain in (entries.get("static_gains") or {}).items():
         content.setdefault("static_gain", {})[name] = gain
     latency = content.get("latency")
@@ -350,7 +355,8 @@ def certificate_of_version_1(entries: Mapping[str, Any]) -> Certificate:
         content["latency"] = {_LATENCY_NAMES_1.get(k, k): v for k, v in latency.items()}
     for error in content.get("model_errors", {}).get("modelled", ()):
         error.pop("modelled", None)
-    return from_json(Certificate, content, "certificate")
+    certificate: Certificate = from_json(Certificate, content, "certificate")
+    return certificate
 
 
 def _verdict(stated: object) -> str:
@@ -378,15 +384,3 @@ def _findings(entries: Mapping[str, Any]) -> list[dict[str, Any]]:
             )
         found += [{"code": TEXT, "severity": severity, "values": {"text": t}} for t in texts]
     return found
-
-
-def _add_candidates(content: dict[str, Any], candidates: object) -> None:
-    known = (
-        [c for c in candidates if isinstance(c, Mapping)] if isinstance(candidates, list) else []
-    )
-    names = ("poles", "zeros", "delay")
-    content["candidates"] = [
-        {"structure": {n: c[n] for n in names}, "bic": c["bic"], "rms_m": c["rms_m"]}
-        for c in known
-        if {*names, "bic", "rms_m"} <= c.keys()
-    ]

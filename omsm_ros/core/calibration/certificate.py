@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from types import NoneType, UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -385,7 +385,8 @@ class Certificate:
     def from_content(cls, content: Mapping[str, Any]) -> Certificate:
         """Return the inverse of :meth:`content`; raise CalibrationError if it is malformed."""
         values = {key: value for key, value in content.items() if key != "schema"}
-        return from_json(cls, values, "certificate")
+        found: Certificate = from_json(cls, values, "certificate")
+        return found
 
 
 def verdict_of(findings: Iterable[Finding]) -> str:
@@ -398,7 +399,6 @@ def verdict_of(findings: Iterable[Finding]) -> str:
 
 # Dataclasses to JSON values and back, each value checked against the type of its field.
 
-Record = TypeVar("Record")
 _SCALARS = {str: "a text", bool: "true or false", int: "a whole number", float: "a finite number"}
 
 
@@ -414,15 +414,11 @@ def to_json(value: Any) -> Any:
     return [to_json(item) for item in value] if isinstance(value, tuple | list) else value
 
 
-def from_json(kind: type[Record], content: object, name: str) -> Record:
-    """Return the dataclass ``kind`` of JSON values; messages call it ``name``.
+def from_json(kind: Any, content: Any, name: str) -> Any:
+    """Return the dataclass or type ``kind`` of JSON values; messages call it ``name``.
 
     Raises CalibrationError for a missing, unknown or mistyped field.
     """
-    return _read(kind, content, name)  # type: ignore[no-any-return]
-
-
-def _read(kind: Any, content: Any, name: str) -> Any:
     if kind in (Any, object):
         return content
     if is_dataclass(kind):
@@ -430,13 +426,13 @@ def _read(kind: Any, content: Any, name: str) -> Any:
     outer, inner = get_origin(kind), get_args(kind)
     if outer in (Union, UnionType):
         wanted = next(part for part in inner if part is not NoneType)
-        return None if content is None else _read(wanted, content, name)
+        return None if content is None else from_json(wanted, content, name)
     if outer is tuple:
         _check(isinstance(content, list | tuple), content, name, "a list")
-        return tuple(_read(inner[0], item, f"{name}[{i}]") for i, item in enumerate(content))
+        return tuple(from_json(inner[0], item, f"{name}[{i}]") for i, item in enumerate(content))
     if outer is not None and issubclass(outer, Mapping):
         _check(isinstance(content, Mapping), content, name, "an object")
-        return {str(key): _read(inner[1], v, f"{name}.{key}") for key, v in content.items()}
+        return {str(key): from_json(inner[1], v, f"{name}.{key}") for key, v in content.items()}
     whole = kind is float and type(content) is int
     fits = (whole or type(content) is kind) and (kind is not float or math.isfinite(content))
     _check(fits, content, name, _SCALARS[kind])
@@ -450,7 +446,7 @@ def _read_fields(kind: Any, content: Any, name: str) -> Any:
         raise CalibrationError("calibration.unknown_field", name=f"{name}.{min(unknown)}")
     if missing := required - content.keys():
         raise CalibrationError("calibration.missing_field", name=f"{name}.{min(missing)}")
-    values = {key: _read(types[key], item, f"{name}.{key}") for key, item in content.items()}
+    values = {key: from_json(types[key], item, f"{name}.{key}") for key, item in content.items()}
     try:
         return kind(**values)
     except CalibrationError:

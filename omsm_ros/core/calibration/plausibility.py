@@ -63,7 +63,13 @@ def check_covariance(covariance: FloatArray, dynamics: TransferFunction, trusted
     least = float(np.min(np.linalg.eigvalsh(correlation), initial=0.0))
     if least < -_INDEFINITE or np.any(covariance[scale == 0] != 0):
         raise CalibrationError("calibration.indefinite_covariance", eigenvalue=least)
-    _check_size(deviation, dynamics, trusted)
+    powers = [*range(len(dynamics.numerator)), *range(1, len(dynamics.denominator)), 1]
+    with np.errstate(over="ignore"):
+        at_end = deviation * (2 * np.pi * trusted) ** np.array(powers, np.float64)
+    if np.any(~(at_end <= _MAX_UNCERTAINTY)):
+        raise CalibrationError(
+            "calibration.large_covariance", frequency=trusted, factor=float(np.max(at_end))
+        )
 
 
 def _inverse(rate: float) -> float:
@@ -95,14 +101,3 @@ def checked_roots(dynamics: TransferFunction, kind: str) -> ComplexArray:
     if not np.all(np.isfinite(roots)):
         raise CalibrationError("calibration.roots", kind=kind)
     return roots
-
-
-def _check_size(deviation: FloatArray, dynamics: TransferFunction, trusted: float) -> None:
-    omega = 2 * np.pi * trusted
-    powers = [*range(len(dynamics.numerator)), *range(1, len(dynamics.denominator)), 1]
-    with np.errstate(over="ignore"):
-        at_end = deviation * omega ** np.array(powers, np.float64)
-    if np.any(~(at_end <= _MAX_UNCERTAINTY)):
-        raise CalibrationError(
-            "calibration.large_covariance", frequency=trusted, factor=float(np.max(at_end))
-        )

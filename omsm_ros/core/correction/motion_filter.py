@@ -7,7 +7,7 @@ within the settling time are marked.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,11 +18,11 @@ from omsm_ros.core.calibration.calibration_set import CalibrationSet
 from omsm_ros.core.correction.uncertainty import (
     covariance_parts,
     derivative_filter,
-    filter_history,
+    past_degree,
     sensitivity_filters,
 )
 from omsm_ros.core.lti.discretisation import DEFAULT_ORDER, DigitalFilter, discretise
-from omsm_ros.core.lti.recursion import START_SAMPLES, Recursion, past_motion
+from omsm_ros.core.lti.recursion import POLYNOMIAL_DEGREE, START_SAMPLES, Recursion, past_motion
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import AngleUnwrapper, BoolArray, FloatArray, RejectionReason
 from omsm_ros.core.streams.pairing import SampleRun
@@ -32,7 +32,6 @@ SETTLED = 1e-6
 _X, _Y, _Z, _B, _C = range(5)
 _AXES = "xyzbc"
 _LATERAL = (_X, _Y, _B, _C)
-Past = Callable[[FloatArray], FloatArray]
 # Rows of the output: x, y, b, c, z - H(z), H(z), rate of H(z), sensitivities.
 ERROR, MOVED, RATE, SENSITIVITIES = 4, 5, 6, 7
 
@@ -47,7 +46,7 @@ class MotionFilters:
     lateral: delay of x, y, b, c by the latency; None without latency
     forgotten: samples after which a wrong initial state of G has decayed to ``SETTLED``
     undetected: number of the last of ``dynamics`` that are of undetected model error
-    pasts: motion before the first samples that each of ``dynamics`` assumes
+    pasts: degree of the motion before the first samples that each of ``dynamics`` assumes
     further: of each further axis that moves the probe: its part of ``height``, and of ``rate``
     Each of ``dynamics`` has filters by the name of the axis.
     """
@@ -58,7 +57,7 @@ class MotionFilters:
     lateral: DigitalFilter | None
     forgotten: int = 2**31
     undetected: int = 0
-    pasts: tuple[Past, ...] = ()
+    pasts: tuple[int, ...] = ()
     further: Mapping[str, tuple[DigitalFilter, DigitalFilter]] = field(default_factory=dict)
 
     @classmethod
@@ -80,7 +79,7 @@ class MotionFilters:
 
         delay = TransferFunction(np.ones(1), np.ones(1), probe_latency)
         noise, undetected = (
-            [(f, filter_history(part)) for f in sensitivity_filters(part, sample_period)]
+            [(f, past_degree(part)) for f in sensitivity_filters(part, sample_period)]
             for part in covariance_parts(calibration)
         )
         return cls(
@@ -90,7 +89,7 @@ class MotionFilters:
             lateral=discretise(delay, sample_period, order) if probe_latency > 0 else None,
             forgotten=forgetting_samples(g, sample_period),
             undetected=len(undetected),
-            pasts=tuple(past for _, past in noise + undetected),
+            pasts=tuple(degree for _, degree in noise + undetected),
             further={
                 axis: (response_of(numerator), rate_of(numerator))
                 for axis, numerator in calibration.further.items()
@@ -137,13 +136,13 @@ class _Bank:
             {_AXES.index(axis): Recursion(one) for axis, one in row.items()}
             for row in (height, rate, *filters.dynamics)
         ]
-        pasts = filters.pasts or (past_motion,) * len(filters.dynamics)
-        self._pasts = (past_motion, past_motion, *pasts)
+        pasts = filters.pasts or (POLYNOMIAL_DEGREE,) * len(filters.dynamics)
+        self._pasts = (POLYNOMIAL_DEGREE, POLYNOMIAL_DEGREE, *pasts)
 
     def start(self, axes: FloatArray) -> None:
-        for row, past in zip(self._rows, self._pasts, strict=True):
+        for row, degree in zip(self._rows, self._pasts, strict=True):
             for axis, recursion in row.items():
-                recursion.start(past(axes[axis].copy()))
+                recursion.start(past_motion(axes[axis].copy(), degree))
 
     def run(self, axes: FloatArray, out: FloatArray) -> None:
         """Write H(z), its rate and its sensitivities into ``out`` (2 + r, n)."""

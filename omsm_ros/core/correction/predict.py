@@ -18,7 +18,7 @@ from omsm_ros.core.correction.motion_filter import SETTLED
 from omsm_ros.core.correction.uncertainty import (
     ErrorSources,
     covariance_parts,
-    filter_history,
+    past_degree,
     sensitivity_filters,
 )
 from omsm_ros.core.kinematics.limits import (
@@ -35,7 +35,7 @@ from omsm_ros.core.lti.discretisation import (
     discretise,
     velocity_spectrum,
 )
-from omsm_ros.core.lti.recursion import START_SAMPLES, Recursion, through
+from omsm_ros.core.lti.recursion import START_SAMPLES, Recursion, past_motion, through
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError, DataError, Notice
@@ -83,7 +83,7 @@ def largest_residual(calibration: Calibration, sample_period: float, z: FloatArr
 def _variance(part: Calibration, sample_period: float, z: FloatArray) -> FloatArray:
     """Return the variance of G z [m²] by the covariance of ``part``, (n,)."""
     variance = np.zeros(len(z))
-    before = filter_history(part)(z[:START_SAMPLES])
+    before = past_motion(z[:START_SAMPLES], past_degree(part))
     for row in sensitivity_filters(part, sample_period):
         if "z" in row:
             recursion = Recursion(row["z"])

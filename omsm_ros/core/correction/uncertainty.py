@@ -8,7 +8,6 @@ Z follows the surface, this is a height error of ``δ dH(z)/dt``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +17,7 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
 from omsm_ros.core.lti.discretisation import DigitalFilter, bilinear, discretise
-from omsm_ros.core.lti.recursion import past_motion, past_stationary
+from omsm_ros.core.lti.recursion import POLYNOMIAL_DEGREE
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import DataError
@@ -159,9 +158,13 @@ def static_until(calibration: Calibration) -> float:
     return 1 / (2 * np.pi * lowest) if lowest > 0 and calibration.covariance[0, 0] > 0 else 0.0
 
 
-def filter_history(calibration: Calibration) -> Callable[[FloatArray], FloatArray]:
-    """Return the function that gives the motion before the first samples of sensitivity filters."""
-    return past_stationary if static_until(calibration) > 0 else past_motion
+def past_degree(calibration: Calibration) -> int:
+    """Return the degree of the motion before the first samples that sensitivity filters assume.
+
+    A filter with a time constant of a minute needs a standstill: a parabola through some samples
+    would be metres of travel so long before.
+    """
+    return 0 if static_until(calibration) > 0 else POLYNOMIAL_DEGREE
 
 
 def derivative_filter(

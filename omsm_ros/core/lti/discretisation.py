@@ -214,18 +214,11 @@ def discretise(
     discrete = np.append(discrete, np.zeros(len(delay_zeros)))
     gain = _gain(dynamics, sample_period, zeros, discrete, late)
     digital = DigitalFilter(_sections(zeros, discrete, gain, late), sample_period)
-    return _checked(digital, dynamics)
-
-
-def _checked(digital: DigitalFilter, dynamics: TransferFunction) -> DigitalFilter:
-    """Return H; raise DataError if it differs from G at slow motion, by aliasing or rounding."""
-    slow = np.array([0.5, 1.0]) * _MATCHED_RAD / (2 * np.pi * digital.sample_period)
+    # H differs from G at slow motion by aliasing or rounding.
+    slow = np.array([0.5, 1.0]) * _MATCHED_RAD / (2 * np.pi * sample_period)
     if not np.allclose(digital.response(slow), dynamics.response(slow), rtol=_TOLERANCE, atol=0.0):
         raise DataError(
-            "lti.not_sampled",
-            period=digital.sample_period,
-            poles=dynamics.poles(),
-            tolerance=_TOLERANCE,
+            "lti.not_sampled", period=sample_period, poles=dynamics.poles(), tolerance=_TOLERANCE
         )
     return digital
 

@@ -21,10 +21,11 @@ START_SAMPLES = 12
 noise of one sample, through five 0.94, and a motion is still a parabola over twelve samples."""
 
 
-def past_motion(first: FloatArray) -> FloatArray:
-    """Return the ascending coefficients (3,) of the parabola through ``first`` (k,), k >= 3.
+def past_motion(first: FloatArray, degree: int = POLYNOMIAL_DEGREE) -> FloatArray:
+    """Return ascending coefficients of the parabola through ``first`` (k,), k >= 3.
 
     It is fitted over the index about the middle sample, where it is best conditioned, then shifted.
+    degree: of the result (degree + 1,), which is cut there; 0 is a standstill at the first sample
     """
     middle = (len(first) - 1) / 2
     index = np.arange(len(first)) - middle
@@ -34,16 +35,7 @@ def past_motion(first: FloatArray) -> FloatArray:
     centred = (weights * (first - start)).sum(axis=1)
     place, rate, bend = centred
     place = place - middle * rate + middle**2 * bend
-    return np.array([start + place, rate - 2 * middle * bend, bend])
-
-
-def past_stationary(first: FloatArray) -> FloatArray:
-    """Return the coefficient (1,) of a standstill at the first sample of :func:`past_motion`.
-
-    A filter with a time constant of a minute needs it: a parabola through some samples would be
-    metres of travel so long before.
-    """
-    return past_motion(first)[:1]
+    return np.array([start + place, rate - 2 * middle * bend, bend])[: degree + 1]
 
 
 class Recursion:

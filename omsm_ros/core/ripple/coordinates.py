@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
+from omsm_ros.core.ripple.scan_signal import LEAST_TURN, PATH, RADIUS, TIME, TURN, ScanSignal
 from omsm_ros.core.streams.blocks import FloatArray
 
 # Width of the kernel and density of the grid, for an error of 1e-7 of the largest line.
@@ -93,15 +93,10 @@ class Coordinate:
 def coordinates_of(signal: ScanSignal) -> dict[str, Coordinate]:
     """Return the coordinates in which the scan moves, by name."""
     found: dict[str, Coordinate] = {}
-    for name in (TIME, PATH, TURN, RADIUS):
+    around = max(1e-3 * float(signal.radius.max()), _LEAST_MOVED_M)
+    for name, least in ((TIME, 0.0), (PATH, _LEAST_MOVED_M), (TURN, LEAST_TURN), (RADIUS, around)):
         values = signal.coordinate(name)
-        reach = float(np.ptp(values))
-        least = {
-            PATH: _LEAST_MOVED_M,
-            RADIUS: max(1e-3 * float(signal.radius.max()), _LEAST_MOVED_M),
-            TURN: 0.01,
-        }
-        if reach > least.get(name, 0.0):
+        if np.ptp(values) > least:
             found[name] = _coordinate(signal, name, values, found)
     return found
 
@@ -138,8 +133,8 @@ def power_over(
         spacing = signal.rate / length
     else:
         spacing = coordinate.resolution / OVERSAMPLING
-        size = min(int(coordinate.highest / spacing), OVERSAMPLING * _MOST_FREQUENCIES)
-        spectrum = fourier_sum(coordinate.values, values, spacing, max(size, 16))
+        size = max(int(coordinate.highest / spacing), 16)
+        spectrum = fourier_sum(coordinate.values, values, spacing, size)
     power = abs(spectrum) ** 2 * (2 / count) ** 2
     return np.asarray(power, np.float64), spacing
 

@@ -15,7 +15,7 @@ LEAST_POINTS = 256
 """Fewest readings for an estimate of the noise floor."""
 
 # A smaller rotation is noise of the spindle encoder [turns].
-_LEAST_TURN = 0.01
+LEAST_TURN = 0.01
 # Parts of a scan over which feed and speed are constant, to average encoder noise.
 _STRETCHES = 200
 
@@ -137,7 +137,7 @@ def track(x: FloatArray, y: FloatArray, turn: FloatArray) -> FloatArray:
     Encoder noise must not accumulate: on a turning part ``ds = √(r² + (dr/dc)²) dc`` with a smooth
     dr/dc; otherwise each step is projected on the smooth direction of the motion.
     """
-    if np.ptp(turn) > _LEAST_TURN:
+    if np.ptp(turn) > LEAST_TURN:
         angle = 2 * np.pi * turn
         radius = np.hypot(x, y)
         knots, slopes = _slopes(angle, radius)

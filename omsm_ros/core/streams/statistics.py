@@ -138,21 +138,17 @@ class EvenSelection:
     """Keeps every k-th row of a stream, with the least power of two k that keeps ``most`` or fewer.
 
     The selection does not depend on the division into blocks.
+    every: the step k from one kept row to the next
     """
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._every = 1
+        self.every = 1
         self._seen = 0
         self._room: NDArray[Any] = np.empty(0)
 
     def __len__(self) -> int:
-        return -(-self._seen // self._every)
-
-    @property
-    def every(self) -> int:
-        """The step k from one kept row to the next."""
-        return self._every
+        return -(-self._seen // self.every)
 
     def add(self, rows: NDArray[Any]) -> None:
         """Take the next ``rows`` (n, …)."""
@@ -160,11 +156,11 @@ class EvenSelection:
 
     def chosen(self, rows: int) -> slice:
         """Return which of the next ``rows`` will be kept, so that only those need be computed."""
-        while -(-(self._seen + rows) // self._every) > self._most:
+        while -(-(self._seen + rows) // self.every) > self._most:
             held = len(self)
             self._room[: -(-held // 2)] = self._room[:held:2].copy()
-            self._every *= 2
-        return slice(-self._seen % self._every, rows, self._every)
+            self.every *= 2
+        return slice(-self._seen % self.every, rows, self.every)
 
     def add_chosen(self, part: NDArray[Any], rows: int) -> None:
         """Take the ``part`` (k, …) of the next ``rows`` that :meth:`chosen` returned."""

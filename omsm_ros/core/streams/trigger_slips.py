@@ -71,6 +71,10 @@ class CommonTrigger(CheckedRecord):
     counter_offset: int = COUNTER_OFFSET.of_field(0)
     stamp_tolerance: float = STAMP_TOLERANCE.of_field(TWO_DRIVERS_S)
 
+    def least_slip(self, period: float) -> float:
+        """Return the skew of stamps without scatter that is a slip [samples of ``period`` [s]]."""
+        return 0.5 + self.stamp_tolerance / period
+
 
 EQUAL_COUNTS = CommonTrigger()
 
@@ -108,7 +112,7 @@ class TriggerSlip:
 
         limit: skew that is a slip [samples]; None takes that of stamps without scatter
         """
-        limit = _steady(trigger, period) if limit is None else limit
+        limit = trigger.least_slip(period) if limit is None else limit
         if abs(skew) < limit:
             return cls()
         samples = round(skew) or int(math.copysign(1, skew))
@@ -126,11 +130,6 @@ class TriggerSlip:
 
     def __str__(self) -> str:
         return str(self.notice())
-
-
-def _steady(trigger: CommonTrigger, period: float) -> float:
-    """Return the skew of stamps without scatter that is a slip [samples]."""
-    return 0.5 + trigger.stamp_tolerance / period
 
 
 class TriggerSlipDetector:
@@ -311,7 +310,7 @@ class TriggerSlipDetector:
         return self._seen.recent(first, self._since, _LEAST_STAMPS)
 
     def _steady(self) -> float:
-        return _steady(self._trigger, self._period_ns / NANOSECONDS_PER_S)
+        return self._trigger.least_slip(self._period_ns / NANOSECONDS_PER_S)
 
     def _limit(self, window: FloatArray) -> float:
         """Return the skew that is a slip [samples]."""

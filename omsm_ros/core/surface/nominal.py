@@ -123,15 +123,13 @@ class ZernikeSurface:
         """Return the height [m] at x, y [m]."""
         u, v = self._on_the_disc(x, y)
         terms, sizes = self._terms()
-        made = sizes @ zernike_values(u.ravel(), v.ravel(), terms) if terms else np.zeros(u.size)
+        made = sizes @ zernike_values(u.ravel(), v.ravel(), terms)
         return np.asarray(made.reshape(u.shape), np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
         """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         u, v = self._on_the_disc(x, y)
         terms, sizes = self._terms()
-        if not terms:
-            return np.zeros(u.shape), np.zeros(u.shape)
         along_x, along_y = (
             (sizes @ slopes / self.radius).reshape(u.shape)
             for slopes in zernike_slopes(u.ravel(), v.ravel(), terms)

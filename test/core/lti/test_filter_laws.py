@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from omsm_ros.core.lti.discretisation import DigitalFilter, bilinear, discretise
-from omsm_ros.core.lti.recursion import Recursion, past_motion, past_stationary, through
+from omsm_ros.core.lti.recursion import Recursion, past_motion, through
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.twin.plant import PAPER_DYNAMICS
@@ -153,8 +153,8 @@ def test_a_rest_is_kept_to_the_last_digits() -> None:
 
 def test_the_rest_of_a_motion_is_where_its_parabola_begins() -> None:
     first = 1e-3 + 3e-6 * np.arange(12.0) - 2e-8 * np.arange(12.0) ** 2
-    assert past_stationary(first) == pytest.approx([1e-3], rel=1e-9)
-    assert past_stationary(first)[0] == past_motion(first)[0]
+    assert past_motion(first, 0) == pytest.approx([1e-3], rel=1e-9)
+    assert past_motion(first, 0)[0] == past_motion(first)[0]
 
 
 @settings(max_examples=30)
