@@ -58,21 +58,24 @@ def orthonormal(columns: FloatArray, tolerance: float) -> FloatArray:
     return np.asarray(left[:, values > tolerance * values[0]])
 
 
-def inverse_gram(gram: FloatArray) -> FloatArray:
+def inverse_gram(gram: FloatArray, tolerance: float = ROUNDING) -> FloatArray:
     """Return the pseudoinverse of products of columns (q, q), without what is rounding."""
-    root = inverse_root(gram)
+    root = inverse_root(gram, tolerance)
     return np.asarray(root @ root.T)
 
 
-def inverse_root(gram: FloatArray, *, keep: bool = False) -> FloatArray:
+def inverse_root(
+    gram: FloatArray, tolerance: float = ROUNDING, *, keep: bool = False
+) -> FloatArray:
     """Return R (q, r) with R Rᵀ the pseudoinverse of products of columns (q, q).
 
-    keep: directions lost in rounding count as the weakest that is not, instead of being left out
+    tolerance: scaled directions weaker than this part of the strongest are lost in rounding
+    keep: those count as the weakest that is not, instead of being left out
     """
     scale = np.sqrt(np.maximum(np.diag(gram), 0.0))  # rounding may leave less than nothing
     scale[scale == 0] = 1.0
     values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
-    least = ROUNDING * np.max(values, initial=0.0)
+    least = tolerance * np.max(values, initial=0.0)
     kept = (values > least) | keep
     values = np.maximum(values[kept], least)
     return np.asarray(directions[:, kept] / np.sqrt(values) / scale[:, np.newaxis])

@@ -15,6 +15,7 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.lti.frequency_response import relative_response_jacobian
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.errors import CalibrationError
+from omsm_ros.linear_algebra import inverse_root
 
 # Evenly over the common band; covariances have fewer independent directions than that.
 _LINES = 30
@@ -106,12 +107,8 @@ def mahalanobis(
 
     tolerance: directions of the correlation with less than this part of the largest are left out
     """
-    scale = np.sqrt(np.diag(covariance))
-    scale[scale == 0] = 1.0
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    known = values > tolerance * values[-1]
-    along = vectors[:, known].T @ (difference / scale)
-    return float(np.sum(along**2 / values[known])), int(np.sum(known))
+    root = inverse_root(covariance, tolerance)
+    return float(np.sum((difference @ root) ** 2)), root.shape[1]
 
 
 # Scatter of repeated step tests, compared with the uncertainty that each states.

@@ -14,6 +14,7 @@ from omsm_ros.core.streams.blocks import (
     DistanceBlock,
     FloatArray,
     known_parts,
+    on_counts,
 )
 from omsm_ros.errors import Notice
 
@@ -82,11 +83,8 @@ class ScanPathReader:
         # Controls that wrap C at a turn would seem to turn hardly at all.
         known = np.isfinite(c)
         c[known] = np.unwrap(c[known])
-        first, end = run[0].first_sample, run[-1].first_sample + len(run[-1])
-        within = [
-            readings[max(first - at, 0) : max(end - at, 0)] for at, readings in self._readings
-        ]
-        distance = np.concatenate(within)[: self._most] if within else None
+        first = run[0].first_sample
+        distance = on_counts(self._readings, first, first + len(z)) if self._readings else None
         return ScanPath(
             z=z,
             sample_period=run[0].sample_period,

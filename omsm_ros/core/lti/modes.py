@@ -26,6 +26,7 @@ from omsm_ros.core.lti.frequency_response import (
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import DataError, IdentificationError
+from omsm_ros.linear_algebra import inverse_root
 
 # Order of the uncertainties of a fitted two-mass model; m1 is given.
 FITTED = ("m2", "k1", "k2", "c1", "c2")
@@ -286,12 +287,8 @@ def _whitener(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
     variance = np.maximum(np.diag(stated), 0.0)
     floor = 1e-6 * float(np.max(variance)) or 1.0
     further = _MODEL_ERROR**2 * np.diag(np.maximum(variance, floor))
-    total = stated + further
-    deviation = np.sqrt(np.maximum(np.diag(total), np.diag(further)))
-    values, directions = np.linalg.eigh(total / np.outer(deviation, deviation))
     # Coefficients of very different size make the covariance indefinite by rounding.
-    least = _INDEFINITE * float(values[-1])
-    return np.asarray((directions / np.sqrt(np.maximum(values, least))).T / deviation)
+    return inverse_root(stated + further, _INDEFINITE, keep=True).T
 
 
 def oscillations(dynamics: TransferFunction) -> tuple[float, ...]:

@@ -20,6 +20,7 @@ from omsm_ros.core.ripple.scan_signal import TURN, ScanSignal
 from omsm_ros.core.ripple.spectral_line import SpectralLine
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, zernike_values
+from omsm_ros.linear_algebra import inverse_gram
 
 Waves: TypeAlias = "Callable[[np.ndarray], FloatArray]"
 """Columns (m, q) to fit together with the form, at the samples (m,) asked for."""
@@ -117,7 +118,7 @@ class FormFit:
         bare, solution = self._height, np.zeros(1)
         for _ in range(2):  # the second pass removes rounding errors of millimetres
             gram, moment = _normal_equations(basis, signal, bare, chosen, waves)
-            inverse = _inverse(gram)
+            inverse = inverse_gram(gram, _LEAST_DETERMINED)
             solution = solution + inverse @ moment
             form = partial(basis.columns, signal)
             residual = self._height - _evaluated(form, len(signal), solution[:own])
@@ -229,14 +230,6 @@ def _normal_equations(
         products.append((columns.T @ columns, columns.T @ values[part]))
     gram, moment = (np.sum(parts, axis=0) for parts in zip(*products, strict=True))
     return gram, moment
-
-
-def _inverse(gram: FloatArray) -> FloatArray:
-    scale = 1 / np.sqrt(np.diag(gram))
-    values, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-    kept = values > _LEAST_DETERMINED * values[-1]
-    half = vectors[:, kept] / np.sqrt(values[kept]) * scale[:, np.newaxis]
-    return np.asarray(half @ half.T)
 
 
 def _evaluated(columns: Waves, count: int, solution: FloatArray) -> FloatArray:

@@ -166,17 +166,14 @@ class EvenSelection:
         """Take the ``part`` (k, …) of the next ``rows`` that :meth:`chosen` returned."""
         held = len(self)
         self._seen += rows
-        if len(part):
-            self._make_room(held, part)
-            self._room[held : held + len(part)] = part
-
-    def _make_room(self, held: int, part: NDArray[Any]) -> None:
         needed = held + len(part)
         if needed > len(self._room):
             room = np.empty((min(max(2 * held, needed), self._most), *part.shape[1:]), part.dtype)
             if held:
                 room[:held] = self._room[:held]
             self._room = room
+        if len(part):
+            self._room[held:needed] = part
 
     def rows(self) -> NDArray[Any]:
         """Return the rows kept so far, in order; a view that is valid until the next are added."""

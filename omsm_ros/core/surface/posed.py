@@ -82,17 +82,15 @@ class PosedSurface:
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m] of the machine; NaN where the surface has none."""
-        pose = self.pose
-        found = _intersected(self.surface, pose.rotation, np.asarray(x) - pose.x, y - pose.y)
-        return np.asarray(found[2] + pose.piston)
+        return np.asarray(self._met(x, y)[2] + self.pose.piston)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
         """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
-        pose = self.pose
-        moved = (np.asarray(x) - pose.x, np.asarray(y) - pose.y)
-        return _turned_slopes(
-            self.surface, pose.rotation, _intersected(self.surface, pose.rotation, *moved)
-        )
+        return _turned_slopes(self.surface, self.pose.rotation, self._met(x, y))
+
+    def _met(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        across, along = np.asarray(x) - self.pose.x, np.asarray(y) - self.pose.y
+        return _intersected(self.surface, self.pose.rotation, across, along)
 
 
 @dataclass(frozen=True, slots=True)
