@@ -20,7 +20,7 @@ from omsm_ros.core.correction.machine_sources import (
     POINT_SOURCES,
     whole_scan_sources,
 )
-from omsm_ros.core.correction.motion_filter import MOVED, RATE, Blend, MotionFilter, MotionFilters
+from omsm_ros.core.correction.motion_filter import MOVED, RATE, MotionFilter, MotionFilters
 from omsm_ros.core.correction.source_kinds import SystematicSource
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.systematic import MOST_TRACED, ScanPoints, ScanTrace
@@ -222,8 +222,7 @@ class Corrector:
         rows = [np.arange(len(f.dynamics)) >= len(f.dynamics) - f.undetected for f in filters]
         # The differences between members of a set come last and are not model errors.
         self.trace.undetected = np.concatenate([*rows, np.zeros(len(filters) - 1, np.bool_)])
-        blend = Blend(known) if isinstance(known, CalibrationSet) else None
-        return MotionFilter(*filters, blend=blend)
+        return MotionFilter(*filters, places=known if isinstance(known, CalibrationSet) else None)
 
     def _join(self) -> None:
         self._correct(self.pairing.pairs())

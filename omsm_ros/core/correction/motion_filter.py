@@ -157,36 +157,21 @@ class _Bank:
         return len(self._rows)
 
 
-class Blend:
-    """Mixes the outputs of several calibrations by the position along one axis.
+def _blended(weights: FloatArray, outputs: Sequence[FloatArray]) -> FloatArray:
+    """Return the mixture of H(z), its rate and its sensitivities, (2 + r, n).
 
-    The filter of each member runs over the whole stream, and the *outputs* are mixed by weights
-    that are continuous in position, so that the result is continuous too.
+    The filter of each member runs over the whole stream, and the *outputs* are mixed by ``weights``
+    (m, n) that are continuous in position, so that the result is continuous too. The errors of the
+    members may be common, so their variances are mixed with the weights. Between two members a and
+    b the response is uncertain by a uniform distribution, ``√(w(1-w)/3) (H_a - H_b)``.
     """
-
-    def __init__(self, places: CalibrationSet) -> None:
-        self._places = places
-        self._axis = {"x": _X, "z": _Z, "b": _B}[places.along]
-
-    def blended(self, axes: FloatArray, outputs: Sequence[FloatArray]) -> FloatArray:
-        """Return the mixture of H(z), its rate and its sensitivities, (2 + r, n).
-
-        The errors of the members may be common, so their variances are mixed with the weights.
-        Between two members a and b the response is uncertain by a uniform distribution,
-        ``√(w(1-w)/3) (H_a - H_b)``.
-        """
-        weights = self._places.weights(axes[self._axis])
-        moved = np.sum([w * out[:2] for w, out in zip(weights, outputs, strict=True)], axis=0)
-        rows = [np.sqrt(w) * out[2:] for w, out in zip(weights, outputs, strict=True)]
-        between = [
-            np.sqrt(weights[k] * weights[k + 1] / 3) * (outputs[k][0] - outputs[k + 1][0])
-            for k in range(len(outputs) - 1)
-        ]
-        return np.concatenate([moved, *rows, between])
-
-    def beyond(self, axes: FloatArray) -> BoolArray:
-        """Return True outside the range of the calibration set (n,)."""
-        return ~self._places.covered(axes[self._axis])
+    moved = np.sum([w * out[:2] for w, out in zip(weights, outputs, strict=True)], axis=0)
+    rows = [np.sqrt(w) * out[2:] for w, out in zip(weights, outputs, strict=True)]
+    between = [
+        np.sqrt(weights[k] * weights[k + 1] / 3) * (outputs[k][0] - outputs[k + 1][0])
+        for k in range(len(outputs) - 1)
+    ]
+    return np.concatenate([moved, *rows, between])
 
 
 class MotionFilter:
@@ -195,12 +180,12 @@ class MotionFilter:
     The output rows are x, y, b, c, z - H(z), H(z), the rate of H(z), and the change of H(z) per
     standard uncertainty along each direction of the calibration's covariance.
 
-    filters: of one calibration, or of each member of the set that ``blend`` mixes
+    filters: of one calibration, or of each member of the set of which ``places`` mixes them
     """
 
-    def __init__(self, *filters: MotionFilters, blend: Blend | None = None) -> None:
+    def __init__(self, *filters: MotionFilters, places: CalibrationSet | None = None) -> None:
         self._banks = [_Bank(each) for each in filters]
-        self._blend = blend
+        self._places = places
         lateral = filters[0].lateral
         self._lateral = {axis: Recursion(lateral) for axis in _LATERAL} if lateral else {}
         turns = any("c" in each.further for each in filters)
@@ -273,20 +258,22 @@ class MotionFilter:
             out[row] = self._lateral[axis].run(samples) if self._lateral else samples
         out[ERROR] = run.values[_Z] - out[MOVED]
         reasons = np.zeros(len(run), np.uint8)
-        if self._blend:
-            reasons[self._blend.beyond(run.values)] = RejectionReason.BEYOND
+        if self._places:
+            position = run.values[_AXES.index(self._places.along)]
+            reasons[~self._places.covered(position)] = RejectionReason.BEYOND
         reasons[: self._unsettled] = RejectionReason.SETTLING
         self._unsettled = max(self._unsettled - len(run), 0)
         return SampleRun(run.session, run.first, run.stamp_ns, run.period_ns, reasons, out)
 
     def _moved(self, axes: FloatArray, out: FloatArray) -> None:
         """Write H(z), its rate and its sensitivities into ``out`` (2 + r, n)."""
-        if not self._blend:
+        if not self._places:
             return self._banks[0].run(axes, out)
         outputs = [np.empty((bank.outputs, axes.shape[1])) for bank in self._banks]
         for bank, rows in zip(self._banks, outputs, strict=True):
             bank.run(axes, rows)
-        out[:] = self._blend.blended(axes, outputs)
+        position = axes[_AXES.index(self._places.along)]
+        out[:] = _blended(self._places.weights(position), outputs)
 
     @property
     def _outputs(self) -> int:

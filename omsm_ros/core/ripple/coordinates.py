@@ -95,7 +95,7 @@ def coordinates_of(signal: ScanSignal) -> dict[str, Coordinate]:
     found: dict[str, Coordinate] = {}
     around = max(1e-3 * float(signal.radius.max()), _LEAST_MOVED_M)
     for name, least in ((TIME, 0.0), (PATH, _LEAST_MOVED_M), (TURN, LEAST_TURN), (RADIUS, around)):
-        values = signal.coordinate(name)
+        values = np.asarray(getattr(signal, name), np.float64)
         if np.ptp(values) > least:
             found[name] = _coordinate(signal, name, values, found)
     return found

@@ -60,10 +60,6 @@ class ScanSignal:
         """Range of the rotation of the spindle [turns]."""
         return float(np.ptp(self.turn))
 
-    def coordinate(self, name: str) -> FloatArray:
-        """Return one of time [s], path [m], radius [m] and turn [turns], (n,)."""
-        return np.asarray(getattr(self, name), np.float64)
-
 
 def scan_signal(
     name: str,

@@ -388,11 +388,5 @@ def without_first_message(block: B, messages: int) -> B:
     if not messages:
         return block
     first, stamp_ns = block.parts[messages].tolist()
-    start = first - block.first_sample
-    return replace(
-        block,
-        first_sample=first,
-        stamp_ns=stamp_ns,
-        parts=block.parts[messages:],
-        **{name: getattr(block, name)[start:] for name in _channels(block)},
-    )
+    rest = part_of(block, first - block.first_sample, len(block))
+    return replace(rest, stamp_ns=stamp_ns, parts=block.parts[messages:])

@@ -7,10 +7,6 @@ from omsm_ros.core.ripple.accelerometer import AccelerationLine, acceleration_li
 from omsm_ros.core.ripple.density import band_stop
 from omsm_ros.core.ripple.lines import find_lines
 from omsm_ros.core.ripple.scan_signal import (
-    PATH,
-    RADIUS,
-    TIME,
-    TURN,
     ScanSignal,
     sampling_over,
     scan_signal,
@@ -107,9 +103,6 @@ class TestSampling:
         assert (len(signal), signal.rate) == (5, 500.0)
         assert signal.duration == pytest.approx(20e-3)
         assert signal.turns == pytest.approx(4.5)
-        for name, values in ((TIME, signal.time), (PATH, signal.path), (RADIUS, signal.radius)):
-            np.testing.assert_array_equal(signal.coordinate(name), values)
-        np.testing.assert_array_equal(signal.coordinate(TURN), signal.turn)
 
 
 class TestScan:
