@@ -69,7 +69,13 @@ class ChrocodileDevice(Chrocodile):
     def _finish(self) -> None:
         self._ask(FORMATS[self._wanted.format])
         layout = self._layout()
-        self._check_line(layout)
+        baud_rate = getattr(self._transport, "baud_rate", None)
+        needed = layout.length * _BITS_PER_BYTE / self._wanted.sample_period
+        if baud_rate is not None and needed > baud_rate:
+            raise DeviceError(
+                f"{self._transport.name}: {layout.length} bytes a sample need {needed:.0f} bit/s, "
+                f"the line has {baud_rate}; raise the baud rate or select fewer signals"
+            )
         binary = self._wanted.format == "binary"
         self._decoder = BinaryDecoder(layout) if binary else LineDecoder(layout)
         self._stream.decoder = self._decoder
@@ -88,15 +94,6 @@ class ChrocodileDevice(Chrocodile):
             )
         self._signals = layout.signals
         return layout
-
-    def _check_line(self, layout: Layout) -> None:
-        baud_rate = getattr(self._transport, "baud_rate", None)
-        needed = layout.length * _BITS_PER_BYTE / self._wanted.sample_period
-        if baud_rate is not None and needed > baud_rate:
-            raise DeviceError(
-                f"{self._transport.name}: {layout.length} bytes a sample need {needed:.0f} bit/s, "
-                f"the line has {baud_rate}; raise the baud rate or select fewer signals"
-            )
 
     def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
         """Return the answer to a command, keeping telegrams; DeviceTimeoutError without one."""
