@@ -2,7 +2,7 @@
 
 The twin's own model of a posed part (fixed-point iteration) makes the points; noise is 10 nm, the
 scan the paper's spiral. The peer for Zernike terms is a least-squares fit with the whole design
-matrix, as prysm's ``lstsq`` solves it, and prysm itself if it is installed.
+matrix, as prysm's ``lstsq`` solves it, and prysm itself in the environment of the peers.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ optional libraries.
 
 import faulthandler
 import importlib
+import logging
 import math
 import multiprocessing
 import os
@@ -44,6 +45,7 @@ def read_in_child(path: Path, what: str, remedy: str, read: Callable[[], T]) -> 
     """
 
     def work() -> T:
+        logging.disable()  # some libraries log the bytes of a damaged file
         with library_errors(what, remedy):
             return read()
 

@@ -1,5 +1,6 @@
 """Maps read by SurfaceTopography, with a stand-in for the library."""
 
+import logging
 import os
 import signal
 import struct
@@ -195,3 +196,18 @@ def test_a_damaged_one_or_a_bomb_is_refused_in_one_sentence(map_of, content, rep
     path.write_bytes(content)
     with pytest.raises(FileError, match=reported):
         read_points(path)
+
+
+def test_what_a_library_logs_about_a_damaged_file_is_not_shown(tmp_path, capfd, monkeypatch):
+    """A reader of .opd files logs all their bytes as an error; nobody handles logs here."""
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    path = tmp_path / "map.opd"
+    path.write_bytes(b"\0" * 100)
+
+    def read():
+        logging.getLogger("reader").error("could not reshape %s", path.read_bytes())
+        raise ValueError("damaged")
+
+    with pytest.raises(FileError, match=r"map\.opd.*damaged; save it again"):
+        child_process.read_in_child(path, "map.opd", "save it again", read)
+    assert "reshape" not in "".join(capfd.readouterr())
