@@ -56,10 +56,10 @@ def overview(folder: Path) -> None:
     calibration = load_calibration(folder / "cal.json")
     cloud = view_of(CloudFile(folder / "whole" / "cloud.ply").read(MOST_DRAWN), 1e-3)
     maps = surface_figures(cloud, PAPER_MIRROR)
-    made, axes = style.figure(4.0, 3.35, rows=2, sharex=True)
+    made, (gain, phase) = style.figure(4.0, 3.35, rows=2, sharex=True)
     frequency = np.geomspace(0.1, 0.5 / calibration.sample_period, 600)
-    draw_response(*axes, frequency, calibration, Plant().dynamics)
-    style.label(axes[1], x="frequency [Hz]")
+    draw_response(gain, phase, frequency, calibration, Plant().dynamics)
+    style.label(phase, x="frequency [Hz]")
     drawn = (maps["raw_map"], maps["corrected_map"], style.png(made))
     parts = [imread(io.BytesIO(one))[..., :3] for one in drawn]
     imsave(IMAGES / "overview.png", np.hstack(parts))

@@ -96,13 +96,13 @@ class CorrectedScan:
         by_stamps: StampJoining | None = None,
         most_traced: int = MOST_TRACED,
     ) -> None:
-        self.path, self.options = recording.path, options
+        self.bag, self.options = recording.path, options
         blocks: Iterator[Any] = (block for _, block in recording.stream(*SCAN_TOPICS))
         if by_stamps is not None:
             blocks = _joined_by_stamps(blocks, by_stamps)
         first = next(blocks, None)
         if first is None:
-            raise BagError(f"{str(self.path)!r} has no samples on {SCAN_TOPICS}; record a scan")
+            raise BagError(f"{str(self.bag)!r} has no samples on {SCAN_TOPICS}; record a scan")
         self.sample_period = float(first.sample_period)
         self.time_lapse = TIME_LAPSE.checked(
             {**calibration.settings, **(admission.settings or {})}.get("time_lapse", 1.0),
@@ -139,14 +139,14 @@ class CorrectedScan:
         lost = min(s.counted.get(name, 0) for s in (account.axes, account.distance))
         if lost:
             raise BagError(
-                f"{str(self.path)!r}: {lost} samples were dropped before their partners came: one "
+                f"{str(self.bag)!r}: {lost} samples were dropped before their partners came: one "
                 f"stream was recorded more than {MAX_PENDING_SAMPLES} samples ahead of the other; "
                 "record both at the same time"
             )
         received = (account.axes.received, account.distance.received)
         for topic, samples in zip(SCAN_TOPICS, received, strict=True):
             if not samples:
-                raise BagError(f"{str(self.path)!r} has no samples on {topic!r}; record a scan")
+                raise BagError(f"{str(self.bag)!r} has no samples on {topic!r}; record a scan")
 
     def read(self) -> tuple[list[AxisBlock], list[SurfacePoints]]:
         """Return all blocks of the axes and all points; BagError as :meth:`steps`."""
@@ -164,7 +164,7 @@ class CorrectedScan:
         axes, distance = self.account.axes, self.account.distance
         if not axes.corrected:
             raise BagError(
-                f"{str(self.path)!r} gives no surface point: of {distance.received} readings "
+                f"{str(self.bag)!r} gives no surface point: of {distance.received} readings "
                 f"{counts_text(distance.counted)}, of {axes.received} axis samples "
                 f"{counts_text(axes.counted)}; check the bag with 'omsm inspect'"
             )

@@ -353,13 +353,7 @@ def sample_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
 def _accuracy_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
     spread = "{peak_to_valley:m} PV, {rms:m} rms (by area)"
     off = "rms {rms:m}, of which {probe_noise_and_resolution:m} from the probe's noise"
-    adjusted = summary["adjustment"]
-    yield "form of the part", headline(adjusted)
-    yield "  verdict", adjusted["verdict"]["text"]
-    for reason in adjusted["verdict"]["reasons"]:
-        yield "", reason["text"]
-    truth = "PV {peak_to_valley:m}; the map is off by {map_error_rms:m/2} rms"
-    yield "  truth of the twin", text_from(truth, adjusted["truth"])
+    yield from adjustment_rows(summary["adjustment"])
     yield "dynamic error before", text_from(spread, summary["dynamic_error_before"])
     yield "  after correction", text_from(spread, summary["dynamic_error_after"])
     yield "cloud minus true surface", text_from(off, summary["surface_deviation"])
@@ -369,3 +363,13 @@ def _accuracy_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
             f"{quantity(row['gain_error'] / PPM, 'ppm', signed=True)}, "
             f"{quantity(row['phase_error_deg'], '°', signed=True)}",
         )
+
+
+def adjustment_rows(adjusted: dict[str, Any]) -> Iterable[tuple[str, str]]:
+    """Yield names and texts of the verdict, and the truth of the twin."""
+    yield "form of the part", headline(adjusted)
+    yield "  verdict", adjusted["verdict"]["text"]
+    for reason in adjusted["verdict"]["reasons"]:
+        yield "", reason["text"]
+    truth = "PV {peak_to_valley:m}; the map is off by {map_error_rms:m/2} rms"
+    yield "  truth of the twin", text_from(truth, adjusted["truth"])
