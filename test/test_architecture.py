@@ -1,9 +1,11 @@
 """The rules of the tree: import contracts, sizes, and calls that no file may make."""
 
 import ast
+import importlib
 from collections import Counter
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from importlinter.cli import lint_imports
@@ -211,6 +213,37 @@ def loaded_by_name():
         *(f"instruments{place.partition(':')[0]}" for place in places if place.startswith(".")),
         "nodes.start",  # by setup.py
     }
+
+
+def test_scripts_outside_the_package_use_names_that_exist():
+    """Most of them run only by hand, on a machine or with LinuxCNC."""
+    paths = [
+        p for f in ("benchmarks", "config", "docs", "launch") for p in (ROOT / f).rglob("*.py")
+    ]
+    assert len(paths) > 40
+    missing = []
+    for path in paths:
+        rooms = {}
+        for node in ast.walk(_tree(path)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("omsm_ros"):
+                room = importlib.import_module(node.module)
+                for alias in node.names:
+                    if not hasattr(room, alias.name):
+                        try:
+                            importlib.import_module(f"{node.module}.{alias.name}")
+                        except ModuleNotFoundError:
+                            missing.append(f"{path.name}: {node.module}.{alias.name}")
+                            continue
+                    value = getattr(room, alias.name)
+                    if isinstance(value, ModuleType):
+                        rooms[alias.asname or alias.name] = value
+        missing += [
+            f"{path.name}: {node.value.id}.{node.attr}"
+            for node in ast.walk(_tree(path))
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
+            and node.value.id in rooms and not hasattr(rooms[node.value.id], node.attr)
+        ]  # fmt: skip
+    assert not missing
 
 
 def test_few_files_are_imported_by_one_other_only():

@@ -101,7 +101,7 @@ def demo(out, radius, seed=1):
     return {
         "driver": driver,
         "lag": calibration.dynamics.low_frequency_delay,
-        "true_lag": demonstrate.true_response(recording).plant_dynamics.low_frequency_delay,
+        "true_lag": recording.truth.response.plant_dynamics.low_frequency_delay,
         "paths": judged,
         "adjustment": {n: facts[n] for n in ("verdict", "figures", "conformity", "truth")},
     }
