@@ -135,10 +135,18 @@ def read(
 
     random: generators of the noise, "probe", and of lost readings, "dropout"
     """
-    samples = len(true_distance)
-    light = _intensity(errors, slope)
+    samples, light = len(true_distance), np.ones(1)
+    if errors.intensity_slope_rad is not None:
+        steep = slope.steepness / errors.intensity_slope_rad
+        light = np.maximum(np.exp(-(steep**2)), _LEAST_INTENSITY)
     noise = probe.noise if not errors.noise_m else float(np.hypot(probe.noise, errors.noise_m))
-    seen = probe.scale * (true_distance + _error(probe, errors, true_distance, slope))
+    off = (
+        errors.cubic_m * (true_distance / probe.half_range) ** 3
+        + errors.periodic_m * np.sin(2 * np.pi * true_distance / errors.period_m)
+        + errors.slope_error_m_per_rad * slope.x
+        + errors.slope_error_m_per_rad2 * slope.steepness**2
+    )
+    seen = probe.scale * (true_distance + off)
     noisy = seen + random["probe"].normal(0.0, noise, samples) / np.sqrt(light)
     resolution = probe.resolution
     reading = np.round(noisy / resolution) * resolution if resolution else noisy
@@ -155,21 +163,3 @@ def read(
         intensity=np.where(there, _FULL_INTENSITY * light, 0.0).astype(np.float32),
         status=np.where(there, Status.OK, Status.NO_TARGET).astype(np.uint8),
     )
-
-
-def _error(probe: Probe, errors: ProbeErrors, distance: FloatArray, slope: Slope) -> FloatArray:
-    """Return the error of the optics at ``distance`` (n,) [m]."""
-    return np.asarray(
-        errors.cubic_m * (distance / probe.half_range) ** 3
-        + errors.periodic_m * np.sin(2 * np.pi * distance / errors.period_m)
-        + errors.slope_error_m_per_rad * slope.x
-        + errors.slope_error_m_per_rad2 * slope.steepness**2
-    )
-
-
-def _intensity(errors: ProbeErrors, slope: Slope) -> FloatArray:
-    """Return the returned light over that of a flat surface, (n,) or (1,)."""
-    if errors.intensity_slope_rad is None:
-        return np.ones(1)
-    steep = slope.steepness / errors.intensity_slope_rad
-    return np.asarray(np.maximum(np.exp(-(steep**2)), _LEAST_INTENSITY), np.float64)

@@ -94,10 +94,6 @@ def _differences(then: Mapping[str, object], now: Mapping[str, object]) -> list[
 
 
 def _same(one: object, other: object) -> bool:
-    if _is_number(one) and _is_number(other):
+    if all(isinstance(v, int | float) and not isinstance(v, bool) for v in (one, other)):
         return bool(np.isclose(one, other, rtol=_SAME_VALUE, atol=0.0))  # type: ignore[call-overload]
     return one == other
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -35,12 +35,14 @@ def check_dynamics(dynamics: TransferFunction, sample_period: float) -> None:
     DELAY.checked(dynamics.delay, CalibrationError)
     _check_samples("delay", dynamics.delay, sample_period, MAX_DELAY_SAMPLES)
     poles, zeros = checked_roots(dynamics, "poles"), checked_roots(dynamics, "zeros")
-    # A zero may be as good as infinite: its coefficient is nothing then.
-    ends = [max(_inverse(rate), TIME_CONSTANT.low) for rate in abs(zeros)]
-    for time in [*ends, *(_inverse(rate) for rate in abs(poles))]:
+    with np.errstate(divide="ignore"):
+        # A zero may be as good as infinite: its coefficient is nothing then.
+        ends = np.maximum(1 / abs(zeros), TIME_CONSTANT.low)
+        times, decays = 1 / abs(poles), 1 / abs(poles.real)
+    for time in [*ends.tolist(), *times.tolist()]:
         TIME_CONSTANT.checked(time, CalibrationError, "time constant of G_m")
     if len(poles):
-        slowest = _inverse(np.min(abs(poles.real)))
+        slowest = float(np.max(decays))
         TIME_CONSTANT.checked(slowest, CalibrationError, "slowest decay of G_m")
         _check_samples("slowest decay", slowest, sample_period, MAX_TIME_CONSTANT_SAMPLES)
 
@@ -70,10 +72,6 @@ def check_covariance(covariance: FloatArray, dynamics: TransferFunction, trusted
         raise CalibrationError(
             "calibration.large_covariance", frequency=trusted, factor=float(np.max(at_end))
         )
-
-
-def _inverse(rate: float) -> float:
-    return 1 / float(rate) if rate else np.inf
 
 
 def _check_samples(name: str, seconds: float, sample_period: float, most: int) -> None:

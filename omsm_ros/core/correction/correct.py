@@ -40,7 +40,7 @@ from omsm_ros.core.streams.pairing import Pairing, SampleRun, StreamInput
 from omsm_ros.core.streams.statistics import RunningScatter
 from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.errors import CalibrationError, ConfigurationError
-from omsm_ros.quantities import GAIN, LAG, WAIT, CheckedRecord
+from omsm_ros.quantities import LAG, WAIT, CheckedRecord
 from omsm_ros.units import NANOSECONDS_PER_S
 
 
@@ -49,7 +49,6 @@ class CorrectionOptions(CheckedRecord):
     """Options of the correction.
 
     polarity: 1 if the distance falls when z rises, -1 for a probe mounted the other way
-    static_gain: probe travel per encoder travel [1]; None takes the calibration's
     accept_other_rate: correct data of another sample period than the calibration's
     max_pending: time that a sample waits for its partner [s]; the newest block always waits
     sources: uncertainties of single points; None takes those of the calibration's certificate
@@ -64,7 +63,6 @@ class CorrectionOptions(CheckedRecord):
     """
 
     polarity: int = 1
-    static_gain: float | None = GAIN.of_field(None)
     accept_other_rate: bool = False
     max_pending: float = WAIT.of_field(10.0)
     sources: ErrorSources | None = None
@@ -103,7 +101,6 @@ class Corrector:
         self._calibration = calibration
         self._options = options
         self._most_waiting = most_waiting
-        self._static_gain = options.static_gain or calibration.static_gain
         self._sources = options.sources or ErrorSources.of(calibration)
         self._period: float | None = None
         self._axes, self._distance = StreamInput(), StreamInput(options.trigger.counter_offset)
@@ -216,7 +213,7 @@ class Corrector:
         members = known.members if isinstance(known, CalibrationSet) else (known,)
         filters = [MotionFilters.of(member, period, lag) for member in members]
         noise_gain = max(each.height.noise_gain for each in filters)
-        self._random = reading_variances(self._sources, noise_gain, self._static_gain)
+        self._random = reading_variances(self._sources, noise_gain, self._calibration.static_gain)
         self._scatter = RunningScatter(float(np.sqrt(sum(self._random.values()))))
         self._random["discretisation"] = self._sources.discretisation**2
         rows = [np.arange(len(f.dynamics)) >= len(f.dynamics) - f.undetected for f in filters]
@@ -244,7 +241,7 @@ class Corrector:
         if self._options.pitch is not None:
             moved = moved - self._options.pitch.over(self._options.geometry.abbe_arm, moved)
         reading, intensity = probe_values
-        away = reading * (self._options.polarity / self._static_gain)
+        away = reading * (self._options.polarity / self._calibration.static_gain)
         where = workpiece_points(self._options.geometry, (x, y, moved), b, c, away)
         time = np.asarray(sample * (axes.period_ns / NANOSECONDS_PER_S), np.float64)
         points = self.trace.add(axes.session, time, where, (b, c), axis_values[MOVED:], away)

@@ -121,14 +121,13 @@ class SourceKind:
 
     quantity: of its standard uncertainty
     fields: change of each height [m] per unit, (k, n), by the parameters
-    parameters: further quantities by name;  optional: those that may be left out
+    parameters: further quantities by name, of which ``correlation_length`` may be left out
     squares: sum of the squares of the fields, (n,), where a shorter way exists
     """
 
     quantity: Quantity
     fields: Callable[[ScanPoints, Parameters], FloatArray]
     parameters: Mapping[str, Quantity] = field(default_factory=dict)
-    optional: tuple[str, ...] = ()
     needs_slope: bool = False
     squares: Callable[[ScanPoints, Parameters], FloatArray] | None = None
 
@@ -160,7 +159,7 @@ class SystematicSource:
                 )
             known[key].checked(size, ConfigurationError, f"{name}.{key}")
         for key in known:
-            if key not in self.parameters and key not in self.kind.optional:
+            if key not in self.parameters and key not in _CORRELATED:
                 unit = known[key].unit or "1"
                 raise ConfigurationError(
                     "correction.needs_parameter", source=name, parameter=key, unit=unit
@@ -202,7 +201,6 @@ _SHARE, _SECONDS = quantities.GAIN_UNCERTAINTY, quantities.TIME_UNCERTAINTY
 _PER_TURN = {"per_turn": quantities.PER_TURN}
 _PERIOD = {"period": quantities.PERIOD}
 _CORRELATED = {"correlation_length": quantities.PERIOD}
-_LENGTH_OPTIONAL = ("correlation_length",)
 
 # Names in files of earlier versions.
 FORMER_NAMES = {"lateral_lag": "probe_latency", "could_hide": "undetected_model_error"}
@@ -249,7 +247,6 @@ KINDS: dict[str, SourceKind] = {
         _METRES,
         lambda p, own: _curve_components(p.slide_x, own),
         _CORRELATED,
-        _LENGTH_OPTIONAL,
         squares=lambda p, _: np.ones(len(p)),
     ),
     "straightness_z": SourceKind(
@@ -257,7 +254,6 @@ KINDS: dict[str, SourceKind] = {
         # The fields of an unknown curve over Z, along X.
         lambda p, own: np.stack([_across(p, bow, 0.0) for bow in _curve_components(p.z, own)]),
         _CORRELATED,
-        _LENGTH_OPTIONAL,
         needs_slope=True,
         squares=lambda p, _: _across(p, 1.0, 0.0) ** 2,
     ),
@@ -268,14 +264,12 @@ KINDS: dict[str, SourceKind] = {
             [_across_both(p, off) for off in _curve_components(p.slide_x, own)]
         ),
         _CORRELATED,
-        _LENGTH_OPTIONAL,
         needs_slope=True,
     ),
     "pitch": SourceKind(
         _RADIANS,
         lambda p, own: own["arm"] * _curve_components(p.z, own),
         {"arm": quantities.LENGTH, **_CORRELATED},
-        _LENGTH_OPTIONAL,
         squares=lambda p, own: np.full(len(p), own["arm"] ** 2),
     ),
     # Both phases of motions that are periodic in the turn.

@@ -63,9 +63,12 @@ def cut(block: Block, edges: Sequence[int]) -> list[Block]:
 
 
 def run(
-    axes: Sequence[Block], distance: Sequence[Block], options: CorrectionOptions | None = None
+    axes: Sequence[Block],
+    distance: Sequence[Block],
+    options: CorrectionOptions | None = None,
+    known: Calibration = CALIBRATION,
 ) -> tuple[SurfacePoints, Account]:
-    corrector = Corrector(CALIBRATION, options or CorrectionOptions())
+    corrector = Corrector(known, options or CorrectionOptions())
     for block in axes:
         corrector.push_axes(block)  # type: ignore[arg-type]
     for block in distance:

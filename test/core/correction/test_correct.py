@@ -68,7 +68,8 @@ def test_points_lie_where_the_probe_looked(quiet_scan: Recording) -> None:
 
 def test_the_static_gain_belongs_to_the_distance(quiet_scan: Recording) -> None:
     scaled, _ = run([quiet_scan.axes], [quiet_scan.distance])
-    plain, _ = run([quiet_scan.axes], [quiet_scan.distance], CorrectionOptions(static_gain=1.0))
+    unscaled = replace(CALIBRATION, static_gain=1.0)
+    plain, _ = run([quiet_scan.axes], [quiet_scan.distance], known=unscaled)
     reading = quiet_scan.distance.distance[plain.sample]
     assert np.allclose(
         scaled.height - plain.height, reading * (1 / PAPER_STATIC_GAIN - 1), atol=1e-15
