@@ -23,7 +23,7 @@ def mode_errors(
 
     Each is (runs,).
     """
-    mode, errors = truth.modes()[index], []
+    mode, errors = known_modes(truth)[index], []
     known = [
         min(
             known_modes(c.dynamics, c.covariance),

@@ -74,13 +74,17 @@ def modal_sum(modes: Sequence[KnownMode], frequency: ArrayLike) -> ComplexArray:
     return response
 
 
-def known_modes(dynamics: TransferFunction, covariance: FloatArray) -> tuple[KnownMode, ...]:
+def known_modes(
+    dynamics: TransferFunction, covariance: FloatArray | None = None
+) -> tuple[KnownMode, ...]:
     """Return the modes of G, slowest first, with first-order uncertainties.
 
-    covariance: (p, p), order numerator, denominator[1:], delay
+    covariance: (p, p), order numerator, denominator[1:], delay; None for no uncertainty
 
     The first-order uncertainty of nearly coinciding poles grows without bound.
     """
+    if covariance is None:
+        covariance = np.zeros((len(dynamics.numerator) + len(dynamics.denominator),) * 2)
     upper = sorted((pole for pole in dynamics.poles() if pole.imag >= 0), key=abs)
     # Where poles coincide, D'(p) = 0.
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -108,8 +112,7 @@ def modal_remainder(dynamics: TransferFunction, up_to: float) -> float | None:
 
     The terms of Eq. 8 lack real poles and the parts in s. None without an oscillating mode.
     """
-    size = len(dynamics.numerator) + len(dynamics.denominator)
-    modes = known_modes(dynamics, np.zeros((size, size)))
+    modes = known_modes(dynamics)
     if all(mode.residue is None for mode in modes):
         return None
     lines = np.linspace(0.0, up_to, GRID_POINTS)
@@ -293,7 +296,7 @@ def _whitener(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
 
 def oscillations(dynamics: TransferFunction) -> tuple[float, ...]:
     """Return the frequencies of the conjugate pairs of poles [Hz], lowest first."""
-    return tuple(mode.frequency for mode in dynamics.modes() if mode.damping < 1)
+    return tuple(mode.frequency for mode in known_modes(dynamics) if mode.residue is not None)
 
 
 def _starts(oscillating: tuple[float, ...], table_mass: float) -> list[FloatArray]:

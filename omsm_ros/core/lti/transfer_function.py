@@ -22,18 +22,6 @@ if TYPE_CHECKING:
 ComplexArray: TypeAlias = NDArray[np.complex128]
 
 
-@dataclass(frozen=True, slots=True)
-class Mode:
-    """A pole or a conjugate pole pair.
-
-    frequency: |pole| / 2π [Hz]
-    damping: ratio ζ; 1 for a real pole in the left half plane
-    """
-
-    frequency: float
-    damping: float
-
-
 @dataclass(frozen=True, slots=True, order=True)
 class Structure:
     """Number of poles and of zeros, at most as many, and whether there is a delay."""
@@ -142,12 +130,6 @@ class TransferFunction:
     def is_stable(self) -> bool:
         """True if all poles lie in the open left half plane."""
         return bool(np.all(self.poles().real < 0))
-
-    def modes(self) -> tuple[Mode, ...]:
-        """Return frequency and damping of the poles, slowest first, once for a conjugate pair."""
-        upper = [p for p in self.poles() if p.imag >= 0]
-        modes = [Mode(float(abs(p) / (2 * np.pi)), float(-p.real / abs(p))) for p in upper]
-        return tuple(sorted(modes, key=lambda mode: mode.frequency))
 
 
 def ascending_roots(coefficients: FloatArray) -> ComplexArray:

@@ -9,6 +9,7 @@ from omsm_ros.core.estimation.model_order import fit
 from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.identification.model_choice import has_initial_response
+from omsm_ros.core.lti.modes import known_modes
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 
 PERIOD, RATE, SAMPLES, SKIPPED = 1e-3, 2 * np.pi * 50, 4000, 50
@@ -76,7 +77,7 @@ def test_a_chance_is_rarely_taken_for_ringing():
 def test_with_free_decays_only_noise_is_left():
     of = problem(3e-6)
     without, found = fitted(of), fitted(replace(of, fits_initial_condition=True))
-    (mode,) = found.dynamics.modes()
+    (mode,) = known_modes(found.dynamics)
     assert mode.damping == pytest.approx(DAMPING, rel=1e-3)
     assert found.gain == pytest.approx(1.0, abs=1e-4)
     assert found.rms == pytest.approx(NOISE, rel=0.05)

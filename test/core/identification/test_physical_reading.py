@@ -32,7 +32,7 @@ def identified(truth, seed, order=0, motion=STEPS, period=1e-3, encoder_noise=4e
 
 def off(calibration, truth, index):
     """Errors of frequency and damping of a mode over what is stated of them."""
-    mode = truth.modes()[index]
+    mode = known_modes(truth)[index]
     known = min(
         known_modes(calibration.dynamics, calibration.covariance),
         key=lambda m: abs(np.log(m.frequency / mode.frequency)),

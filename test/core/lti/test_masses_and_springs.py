@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.lti.frequency_response import relative_response_jacobian
-from omsm_ros.core.lti.modes import FITTED, TwoMass, fit_two_mass, oscillations, response_features
+from omsm_ros.core.lti.modes import (
+    FITTED,
+    TwoMass,
+    fit_two_mass,
+    known_modes,
+    oscillations,
+    response_features,
+)
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import DataError, IdentificationError
 from omsm_ros.twin.plant import PAPER_EQ_12
@@ -53,7 +60,7 @@ def test_only_conjugate_pairs_oscillate():
     dynamics = MACHINE.non_collocated()
     slow = np.polynomial.polynomial.polymul(dynamics.denominator, [1.0, 0.1])
     damped = TransferFunction(dynamics.numerator, slow)
-    assert oscillations(damped) == pytest.approx([m.frequency for m in dynamics.modes()])
+    assert oscillations(damped) == pytest.approx([m.frequency for m in known_modes(dynamics)])
 
 
 @pytest.mark.parametrize("collocated", [False, True])
@@ -144,7 +151,7 @@ def test_the_dip_of_a_driven_mass_is_where_the_other_absorbs():
     light = TwoMass(m1=10.0, m2=2.0, k1=8e6, k2=1.6e6, c1=900.0, c2=6.0)
     read = response_features(light.collocated(), 500.0)
     assert read["minimum"] == pytest.approx(np.sqrt(light.k2 / light.m2) / (2 * np.pi), rel=2e-3)
-    modes = light.collocated().modes()
+    modes = known_modes(light.collocated())
     assert read["resonance"] == pytest.approx(modes[0].frequency, rel=0.01)
 
 
