@@ -291,13 +291,11 @@ def settings_with(
 
 # Where an entry of version 1 stands now; a path of two names is a group and its field.
 _PLACES_1 = {
-    "input": ("origin", "input"),
-    "recorded_ns": ("origin", "recorded_ns"),
-    "structure": ("structure",),
-    "noise_covariance": ("noise_covariance",),
-    "consistency": ("consistency",),
-    "latency": ("latency",),
-    "self_calibration": ("self_calibration",),
+    **{name: ("origin", name) for name in ("input", "recorded_ns")},
+    **{
+        name: (name,)
+        for name in ("structure", "noise_covariance", "consistency", "latency", "self_calibration")
+    },
     "valid_from": ("validity", "from_hz"),
     "shown_up_to_hz": ("validity", "excited_up_to_hz"),
     "residual_rms_m": ("residual", "rms_m"),

@@ -84,9 +84,7 @@ def acceleration_lines(period: float, axes: dict[str, FloatArray]) -> Accelerati
 
     For lines with one frequency on several axes the strongest is kept.
     """
-    found: list[AccelerationLine] = []
-    for axis, values in axes.items():
-        found += _lines(period, axis, values)
+    found = [line for axis, values in axes.items() for line in _lines(period, axis, values)]
     kept: list[AccelerationLine] = []
     duration = period * max(map(len, axes.values()))
     for line in sorted(found, key=lambda line: -line.acceleration):
