@@ -232,7 +232,7 @@ def _without_dust(
 ) -> tuple[list[ScanView], FloatArray, Solution]:
     """Return ``views`` without dust, how far it is off (d,) [m], and a first solution."""
     first = _started(_network(scans, views, priors), priors)
-    dust = [dust_of(first, view) for view in views]
+    dust = dust_of(first, views)
     away = np.concatenate([heights for _, heights in dust])
     if len(away):
         views = [v.part(np.setdiff1d(np.arange(len(v)), points))

@@ -4,9 +4,11 @@ They are looked for in the residuals of a first fit. Each finding becomes a fami
 columns, and is tested as all others are.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.adjustment.families import REPEATED_TRACK, only
 from omsm_ros.core.adjustment.network import Solution
@@ -44,15 +46,25 @@ def _left(solution: Solution, view: ScanView) -> FloatArray:
     return np.asarray(view.deviation - np.interp(view.since, net.blocks.since[mine], fitted))
 
 
-def dust_of(solution: Solution, view: ScanView) -> tuple[IntArray, FloatArray]:
-    """Return which points of one scan are dust, as a registration finds it, and how high [m]."""
-    left = _left(solution, view)
-    far = FarPoints(outlier_limit(left))
-    nothing = np.empty((0, len(left)))
-    points = Placed(view.x, view.y, left, nothing, nothing, nothing)
-    far.add(points, left, np.ones(len(left), np.bool_))
-    dust, _ = far.dust(ISOLATED)
-    return dust, left[dust]
+def dust_of(solution: Solution, views: Sequence[ScanView]) -> list[tuple[IntArray, FloatArray]]:
+    """Return by scan which points are dust, as a registration finds it, and how high [m].
+
+    What the tracks of one scan do not confirm is narrower than they are apart. The map does not
+    resolve it, so that far points of another scan at the same place are left out, too.
+    """
+    found, dust, reach = [], [np.empty((0, 2))], 0.0
+    for view in views:
+        left = _left(solution, view)
+        collected, nothing = FarPoints(outlier_limit(left)), np.empty((0, len(left)))
+        points = Placed(view.x, view.y, left, nothing, nothing, nothing)
+        far = np.flatnonzero(collected.add(points, left, np.ones(len(left), np.bool_)))
+        places = np.stack([view.x, view.y], axis=1)
+        found.append((far, left[far], places[far]))
+        dust.append(places[collected.dust(ISOLATED)[0]])
+        reach = max(reach, collected.space().reach)
+    known = scipy.spatial.cKDTree(np.concatenate(dust))
+    near = [known.query(places)[0] < reach for *_, places in found]
+    return [(far[n], height[n]) for (far, height, _), n in zip(found, near, strict=True)]
 
 
 def lines_of(solution: Solution, view: ScanView) -> list[Family]:

@@ -471,8 +471,6 @@ def _resembled(
 
     Each has its name, and its change of the map as one standard uncertainty (n,) [m].
     """
-    if not np.any(made.height):
-        return []
     used = [k for k, t in enumerate(terms) if t.n >= 2]
     fit, degrees = by_height[used], np.array([terms[k].n for k in used])
     symmetric = np.array([terms[k].m == 0 for k in used])

@@ -72,6 +72,21 @@ def test_dust_is_left_out(table):
     assert found.form.pv.value == pytest.approx(two.form.pv.value, abs=2e-9)
 
 
+def test_a_grain_that_the_tracks_of_one_scan_alone_confirm_is_left_out(table):
+    """400 nm over 0.4 mm, where the scan from beyond the centre crosses it on both sides."""
+    machine, (inwards, *_), _ = table
+    beyond = machine.scan(60, start=-0.3 * RADIUS_M, end=RADIUS_M)
+    seen = []
+    for scan in (inwards, beyond):
+        grain = 400e-9 * (np.abs(scan.x + 1j * scan.y - 1e-3 * np.exp(1j)) < 200e-6)
+        seen.append(replace(scan, height=scan.height + grain, distance=scan.distance + grain))
+    found = adjust(seen, exact_priors(), nominal=MIRROR, accuracy=25e-9)
+    clean = adjust([inwards, beyond], exact_priors(), nominal=MIRROR, accuracy=25e-9)
+    assert not found.refutations
+    assert found.verdict.code == clean.verdict.code
+    assert found.form.pv.value == pytest.approx(clean.form.pv.value, abs=2e-9)
+
+
 def test_what_three_speeds_show_is_advised_after_two(table):
     """Twice the speed was scanned already: a lag that depends on it needs yet another one."""
     _, _, (one, two, _) = table
