@@ -488,4 +488,5 @@ def _resembled(
         gain, values = form.looks_like(fit @ shape, known)
         found.append((family.name, gain, shape @ values))
     probable = probabilities([gain for _, gain, _ in found])
-    return [(found[k][0], np.sqrt(probable[k]) * found[k][2]) for k in np.argsort(-probable)]
+    return [(found[k][0], np.sqrt(probable[k]) * found[k][2])
+            for k in np.argsort(-probable) if found[k][1] > 0]  # fmt: skip

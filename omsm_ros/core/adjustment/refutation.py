@@ -11,7 +11,7 @@ import numpy as np
 
 from omsm_ros.core.adjustment.evidence import Evidence, evidence_of
 from omsm_ros.core.adjustment.network import LEAST_VARIANCE, Network, Scales, Sizes, Solution, solve
-from omsm_ros.core.adjustment.sources import FREE, base_name
+from omsm_ros.core.adjustment.sources import FREE, LAG_CHANGE, base_name
 from omsm_ros.core.streams.blocks import FloatArray
 
 # One in five hundred clean adjustments has one of some sixty families beyond: 4.2 σ each.
@@ -30,8 +30,6 @@ MODEL_SHARE = 0.01
 _RIVAL_SHARE, _RARE, _FAR_BEYOND = 0.2, 3.0, 3.0
 # A family whose value changes by less than this share is a cause of its own.
 _UNCHANGED = 0.3
-# A lag that depends on something has an unknown mean, which is no further cause.
-_OFFSET = "lag_change"
 _MOST_RELEASED = 8
 # Further culprits that are tried first.
 _MOST_TRIED = 3
@@ -282,7 +280,8 @@ def _grouped(
             of.append(len(causes) - 1)
             continue
         of.append(0)
-        if one.name != _OFFSET:
+        # A lag that depends on something has an unknown mean, which is no further cause.
+        if one.name != LAG_CHANGE:
             left[0] += one.evidence.chi_square
     shares = []
     for k, (cause, more) in enumerate(zip(causes, left, strict=True)):
