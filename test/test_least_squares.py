@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.linear_algebra import least_squares, orthonormal, unit_columns
+from omsm_ros.linear_algebra import basis_and_inverse, least_squares, unit_columns
 
 RANDOM = np.random.default_rng(1)
 COLUMNS = RANDOM.normal(size=(50, 3)) * [1e-9, 1.0, 1e12]
@@ -35,8 +35,20 @@ def test_a_column_of_zeros_gets_nothing():
 
 def test_a_direction_below_the_tolerance_is_left_out():
     twice = np.column_stack([COLUMNS[:, 1], COLUMNS[:, 1] * (1 + 1e-9), COLUMNS[:, 2]])
-    assert orthonormal(twice, 1e-6).shape == (50, 2)
-    basis = orthonormal(COLUMNS, 1e-6)
+    assert basis_and_inverse(twice, 1e-6)[0].shape == (50, 2)
+    basis, parameters = basis_and_inverse(COLUMNS, 1e-6)
+    assert COLUMNS @ parameters == pytest.approx(basis, abs=1e-12)
     assert basis.T @ basis == pytest.approx(np.eye(3), abs=1e-12)
     column = COLUMNS[:, 0] * 1e9
     assert basis @ (basis.T @ column) == pytest.approx(column, abs=1e-12)
+
+
+def test_a_basis_of_many_rows_is_that_of_numpy():
+    """Two columns of a walk differ by a millionth: the basis is orthogonal to the rounding left."""
+    rng = np.random.default_rng(2)
+    many = np.cumsum(rng.normal(size=(30_000, 5)), axis=0)
+    many[:, 4] = many[:, 3] + 1e-6 * rng.normal(size=30_000)
+    basis = basis_and_inverse(many, 1e-12)[0]
+    assert basis.T @ basis == pytest.approx(np.eye(5), abs=1e-7)
+    left = np.linalg.svd(unit_columns(many)[0], full_matrices=False)[0]
+    assert np.abs(np.linalg.eigvalsh(basis.T @ left @ left.T @ basis)) == pytest.approx(1.0)

@@ -8,7 +8,7 @@ from omsm_ros.core.estimation.noise import RandomWalk, scatter_in_time, uneven_r
 from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
-from omsm_ros.linear_algebra import orthonormal
+from omsm_ros.linear_algebra import basis_and_inverse
 
 # Two orders for each of six lines of hum.
 _MAX_NOISE_ORDER = 12
@@ -87,13 +87,13 @@ def weighted_gram(rows: FloatArray, length: int, noise: FloatArray) -> FloatArra
 
     noise: (``length`` // 2 + 1,), at the frequencies of a transform of ``length``
     """
-    weight = 2.0 * noise / length
-    weight[0] *= 0.5
+    weight = np.sqrt(2.0 * noise / length)
+    weight[0] *= np.sqrt(0.5)
     if length % 2 == 0:
-        weight[-1] *= 0.5
+        weight[-1] *= np.sqrt(0.5)
     parts = np.empty((len(rows), 2 * len(weight)))
     for row, part in zip(rows, parts, strict=True):
-        part[:] = (np.sqrt(weight) * fft.rfft(row, length)).view(np.float64)
+        np.multiply(weight, fft.rfft(row, length), out=part.view(np.complex128))
     return np.asarray(parts @ parts.T)
 
 
@@ -123,7 +123,7 @@ def parameter_covariance(
     score_covariance = uneven.T @ uneven
     walk = 0.0
     if walks:
-        likelihood = RandomWalk.of(problem, orthonormal(columns, _RANK_TOLERANCE))
+        likelihood = RandomWalk.of(problem, basis_and_inverse(columns, _RANK_TOLERANCE)[0])
         left = problem.on_grid(residual, 0.0)
         walk = likelihood.variance(left, on_grid[:0])[0] if likelihood.shows(left) else 0.0
     missed = problem.on_grid(residual, np.nan)

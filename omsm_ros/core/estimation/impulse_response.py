@@ -7,6 +7,7 @@ that is smooth and decays. Its parameters maximise the marginal likelihood (Pill
 import numpy as np
 from scipy import linalg, ndimage, signal
 
+from omsm_ros.core.estimation.optimisation import CONVERGED, REFILLED
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 
 # Most taps of all inputs together: the eigenvalues of their matrix take half a second.
@@ -22,43 +23,57 @@ _DECAYS, _RATIOS = (3.0, 10.0, 40.0), 10.0 ** np.arange(-8.0, 2.0)
 def impulse_response(inputs: FloatArray, output: FloatArray, used: BoolArray) -> FloatArray | None:
     """Return the impulse responses (m, L) of ``inputs`` (n, m), to ``output`` (n,) where ``used``.
 
-    None where the record is too short. Missing samples of the output are interpolated.
+    None where the record is too short. Missing samples of the output are filled in with the
+    response (expectation maximisation, Dempster et al. 1977).
     """
     samples, count = inputs.shape
     taps = min(_MOST_TAPS // count, int(np.sum(used)) // (_SAMPLES_PER_TAP * count))
     if taps < _LEAST_TAPS:
         return None
-    index = np.arange(samples)
+    index, kept = np.arange(samples), used[taps - 1 :]
     target = np.interp(index, index[used], output[used])[taps - 1 :]
-    target = target - np.mean(target)
-    gram, moment = gram_of(inputs, target, taps)
-    power, least, best = float(target @ target), np.inf, np.zeros(len(moment))
+    gram, _ = gram_of(inputs, target, taps)
+    kernels = []
     for decay in _DECAYS:
         # A root R of the kernel, K = R Rᵀ: sums of steps that decay.
         kernel = np.exp(-decay * np.arange(taps + 1) / taps)
         own = np.triu(np.ones((taps, taps))) * np.sqrt(kernel[:-1] - kernel[1:])
         root = linalg.block_diag(*[own] * count)
         values, directions = np.linalg.eigh(root.T @ gram @ root)
-        along, values = directions.T @ (root.T @ moment), np.maximum(values, 0.0)
-        unit = float(values[-1])
-        for ratio in _RATIOS * unit:
-            unexplained = power - float(np.sum(along**2 / (values + ratio)))
-            score = len(target) * np.log(max(unexplained, np.finfo(float).tiny))
-            score += float(np.sum(np.log1p(values / ratio)))
-            if score < least:
-                least, best = score, root @ (directions @ (along / (values + ratio)))
-    return best.reshape(count, taps)
+        kernels.append((root @ directions, np.maximum(values, 0.0)))
+    for _ in range(REFILLED):
+        target = target - np.mean(target)
+        power, moment = float(target @ target), moments_of(inputs, target, taps).ravel()
+        least, best = np.inf, np.zeros(count * taps)
+        for turn, values in kernels:
+            along = moment @ turn
+            for ratio in _RATIOS * float(values[-1]):
+                unexplained = power - float(np.sum(along**2 / (values + ratio)))
+                score = len(target) * np.log(max(unexplained, np.finfo(float).tiny))
+                score += float(np.sum(np.log1p(values / ratio)))
+                if score < least:
+                    least, best = score, turn @ (along / (values + ratio))
+        found = best.reshape(count, taps)
+        missed = target - np.sum(signal.fftconvolve(inputs.T, found, "valid", axes=1), axis=0)
+        change = np.where(kept, 0.0, np.mean(missed, where=kept) - missed)
+        if float(change @ change) <= CONVERGED * power:
+            break
+        target += change
+    return found
+
+
+def moments_of(inputs: FloatArray, target: FloatArray, taps: int) -> FloatArray:
+    """Return the products (m, L) of the delayed inputs with ``target`` (k,)."""
+    every = [signal.correlate(u, target, "valid", "fft")[::-1] for u in inputs.T]
+    return np.reshape(every, (-1, taps))
 
 
 def gram_of(inputs: FloatArray, target: FloatArray, taps: int) -> tuple[FloatArray, FloatArray]:
     """Return the Gram matrix (mL, mL) of the delayed inputs, without means, and their moments."""
     samples, count = len(target), inputs.shape[1]
     gram = np.empty((count, taps, count, taps))
-    moment = np.empty((count, taps))
-    means = np.empty((count, taps))
+    moment, means = (moments_of(inputs, v, taps) for v in (target, np.ones(samples) / samples))
     for i, first in enumerate(inputs.T):
-        moment[i] = signal.correlate(first, target, "valid", "fft")[::-1]
-        means[i] = signal.correlate(first, np.ones(samples), "valid", "fft")[::-1] / samples
         for j, second in enumerate(inputs.T):
             # Σ_n first[n - k] second[n - l] at place k, l: first row and column, then a recursion.
             part = gram[i, :, j]

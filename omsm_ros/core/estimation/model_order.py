@@ -19,7 +19,13 @@ import numpy as np
 from scipy import signal
 
 from omsm_ros.core.estimation.model_structure import Fit, ScaledStructure
-from omsm_ros.core.estimation.optimisation import CONVERGED, EvaluationBudget, Projection, descend
+from omsm_ros.core.estimation.optimisation import (
+    CONVERGED,
+    REFILLED,
+    EvaluationBudget,
+    Projection,
+    descend,
+)
 from omsm_ros.core.estimation.output_error import CompressedProblem, Problem
 from omsm_ros.core.lti.transfer_function import (
     ComplexArray,
@@ -168,8 +174,6 @@ def cancels(dynamics: TransferFunction) -> bool:
 _RACE_EVALUATIONS = 5
 # Most iterations from the best start: it bounds fits along a flat valley, others converge.
 _FINISH_EVALUATIONS = 60
-# Most times that what is not compared is filled in anew; where it is a tenth, some need thirty.
-_REFILLED = 40
 
 
 def fit(
@@ -208,15 +212,18 @@ def fit(
             now = lines.filled(compared(at))
             at = project(at.nonlinear)
         ends.append(descend(project, at, box, _RACE_EVALUATIONS))
-    if part:  # all starts have the same sums
-        ends = [min(ends, key=lambda end: float(end.residual @ end.residual))]
+    if part:  # all starts have the same sums, of few values
+        first = min(ends, key=lambda end: float(end.residual @ end.residual))
+        ends = [descend(project, first, box, _FINISH_EVALUATIONS)]
     best = min(map(compared, ends), key=lambda found: found.sum_of_squares)
     evaluations = _FINISH_EVALUATIONS
-    for _ in range(_REFILLED):
+    for _ in range(REFILLED):
         now = problem if lines is None else lines.filled(best)
         found = compared(descend(project, project(best.nonlinear), box, evaluations))
         gain, best = best.sum_of_squares - found.sum_of_squares, found
-        if lines is None or gain * best.samples < least_gain * best.sum_of_squares:
+        # The next one would gain at most the share of the period that is not compared.
+        next_gain = gain * (1 - best.samples / problem.closed_length)
+        if lines is None or next_gain * best.samples < least_gain * best.sum_of_squares:
             break
         evaluations = _RACE_EVALUATIONS
     return best if lines is None or part else problem.evaluated(structure, best.nonlinear)

@@ -65,7 +65,7 @@ class ScaledStructure:
             denominator *= _section_at(section, s)
         if not self.structure.delay:
             return np.asarray(1 / denominator)
-        return np.asarray(np.exp(-self._delay(nonlinear) * s) / denominator)
+        return np.asarray(_delayed(s, self._delay(nonlinear)) / denominator)
 
     def lag_slopes(self, nonlinear: FloatArray, s: ComplexArray) -> ComplexArray:
         """Return d ln L / dψ (len ψ, k) at scaled ``s`` (k,), see :meth:`lag`."""
@@ -127,6 +127,15 @@ def _section_at(section: FloatArray, s: ComplexArray) -> ComplexArray:
     """Return 1 + d1 s + d2 s² at ``s`` (k,); a general polynomial takes longer."""
     last = s * section[-1]
     return np.asarray(1.0 + (last if len(section) == 2 else s * (section[1] + last)))
+
+
+def _delayed(s: ComplexArray, delay: float) -> ComplexArray:
+    """Return e^{-τs} at ``s`` (k,); of lines evenly from 0 as products of √k values each."""
+    size, last = int(np.sqrt(len(s))) + 1, len(s) - 1
+    if last < 1 or s[0] != 0 or abs(s[last] - last * s[1]) > 1e-9 * abs(s[last]):
+        return np.asarray(np.exp(-delay * s))
+    whole = np.exp(-delay * s[1] * size * np.arange(size))
+    return np.outer(whole, np.exp(-delay * s[:size])).ravel()[: len(s)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -479,5 +479,7 @@ def with_walk(noise: FloatArray, walk: float, length: int) -> FloatArray:
 
     walk: variance per sample of its increments
     """
+    if walk == 0:
+        return noise
     rate = 2 * np.sin(np.pi * np.arange(1, len(noise)) / length)
     return np.append(noise[0], np.maximum(noise[1:], walk / rate**2))

@@ -19,6 +19,8 @@ _SMALLEST_STEP = 1e-9
 _LONGEST_STEP = 3.0
 # Part of the decrease of χ² that one parameter makes by chance.
 CONVERGED = 1e-4
+# Most times that what is not compared is filled in anew; where it is a tenth, some need thirty.
+REFILLED = 40
 # All accepted of 270 disturbed step tests needed at most 1200 evaluations before their last round,
 # half of them fewer than 250. 1500 of 20 s at 1 kHz take five seconds; most evaluations of a long
 # record use a part of it, and 300 all of it.

@@ -17,14 +17,15 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from scipy import fft, linalg, ndimage
+from numpy.polynomial import polynomial
+from scipy import fft, ndimage
 
 from omsm_ros.core.estimation.model_structure import Fit, ScaledStructure
 from omsm_ros.core.estimation.optimisation import Projection
 from omsm_ros.core.estimation.parallel_sections import close_period
 from omsm_ros.core.lti.transfer_function import ComplexArray, Structure
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
-from omsm_ros.linear_algebra import BLOCK_VALUES, inverse_gram, least_squares, without_copy
+from omsm_ros.linear_algebra import BLOCK_VALUES, basis_and_inverse, inverse_gram, without_copy
 
 # Lines over which power is averaged: it is then known to 10 %.
 _SMOOTHING_BINS = 101
@@ -50,14 +51,12 @@ def denoised(spectrum: ComplexArray, noise_power: float) -> ComplexArray:
 
 # Linear columns weaker than this part of the strongest are rounding.
 _RANK_TOLERANCE = 1e-12
-# Block size of LAPACK.
-_BLOCK = 32
 # Largest share of a period that is not compared where products are summed over lines.
 _FEW_MISSING = 0.25
 # Slow model errors thin records of twice as many samples; a step test at 1 kHz has 20 000.
 ENOUGH_SAMPLES = 20_000
-# Sums over lines of a long problem, and the frequency of the lowest one over its width.
-_SUMS, _DENSE = 10_000, 64
+# Frequency over the width of a sum over lines: four in the width of a mode of ζ = 0.002.
+_SUMS = 1000
 # Exponent of e to which the pulse before a record has decayed where its band ends.
 _PULSE_END = 14.0
 
@@ -70,14 +69,14 @@ def _driven(
     drives: Sequence[tuple[ComplexArray, int]], s: ComplexArray, lag: ComplexArray
 ) -> ComplexArray:
     """Return the spectra of the linear columns, s^i · lag · drive, shape (terms, k)."""
-    terms = []
+    terms = np.empty((sum(count for _, count in drives), len(s)), np.complex128)
+    rows = iter(terms)
     for spectrum, count in drives:
-        term = lag * spectrum
+        term, factor = lag, spectrum
         # Repeated products are faster than powers of complex numbers.
         for _ in range(count):
-            terms.append(term)
-            term = term * s
-    return np.array(terms)
+            term, factor = np.multiply(term, factor, out=next(rows)), s
+    return terms
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,16 +229,12 @@ class Problem:
         """Return the residual at one ψ after the linear parameters are eliminated."""
         driven = self._driven(scaled, nonlinear)
         moved = self._in_time(driven)
-        # In the memory order of LAPACK: in that of numpy it takes five times as long.
-        columns = np.concatenate([moved, self._fixed.T, self.target[np.newaxis]]).T
-        size = columns.shape[1] - 1
-        # With the target as the last column, its part in their basis is in the triangle.
-        (packed, factors), triangle = linalg.qr(columns, mode="raw", check_finite=False)
-        linear = least_squares(triangle[:size, :size], triangle[:size, size], _RANK_TOLERANCE)
-        residual = self.target - columns[:, :size] @ linear
+        columns = np.concatenate([moved, self._fixed.T]).T
+        basis, parameters = basis_and_inverse(columns, _RANK_TOLERANCE)
+        linear = parameters @ (basis.T @ self.target)
+        residual = self.target - columns @ linear
 
         def normal() -> tuple[FloatArray, FloatArray]:
-            basis = linalg.lapack.dorgqr(packed[:, :size], factors[:size], lwork=_BLOCK * size)[0]
             answer = linear[: len(moved)] @ driven
             slopes = self._in_time(scaled.lag_slopes(nonlinear, self.s) * answer).T
             jacobian = basis @ (basis.T @ slopes) - slopes
@@ -296,12 +291,17 @@ class Problem:
 
     def output_spectrum(self, fitted: Fit) -> ComplexArray:
         """Return the spectrum of the motion through G and gain of ``fitted``, at ``s``, (k,)."""
-        driven = self._driven(fitted.scaled, fitted.nonlinear)[: len(fitted.numerator)]
-        return np.asarray(fitted.driven[: len(driven)] @ driven, np.complex128)
+        return self._through(fitted, self.drives(fitted.structure)[:1])
 
     def driven_spectrum(self, fitted: Fit) -> ComplexArray:
         """Return the spectrum of the output of ``fitted`` without background, at ``s``, (k,)."""
-        return np.asarray(fitted.driven @ self._driven(fitted.scaled, fitted.nonlinear))
+        return self._through(fitted, self.drives(fitted.structure))
+
+    def _through(self, fitted: Fit, drives: Sequence[tuple[ComplexArray, int]]) -> ComplexArray:
+        ends = np.cumsum([count for _, count in drives])
+        parts = zip(drives, np.split(fitted.driven[: ends[-1]], ends[:-1]), strict=True)
+        moved = sum(each[0] * polynomial.polyval(self.s, part) for each, part in parts if len(part))
+        return np.asarray(fitted.scaled.lag(fitted.nonlinear, self.s) * moved, np.complex128)
 
     def modelled(self, fitted: Fit) -> FloatArray:
         """Return the output (n,) of the fitted model at every sample."""
@@ -374,8 +374,10 @@ class CompressedProblem:
     filled: Callable[[Fit], CompressedProblem]
 
     @classmethod
-    def of(cls, problem: Problem, lines: int = 0) -> CompressedProblem:
-        """Return ``problem`` by about ``lines`` sums, or by each line if 0 or for several inputs.
+    def of(cls, problem: Problem, narrow: int = 0) -> CompressedProblem:
+        """Return ``problem`` by each line if 0 or for several inputs, or by sums.
+
+        narrow: frequency of a sum over its width
 
         Samples that are not compared are filled in with the output of a model (expectation
         maximisation, Dempster et al. 1977), here with the static gain.
@@ -386,10 +388,9 @@ class CompressedProblem:
         inputs = np.array([weights * drive for drive, _ in problem.drives(static.structure)])
         alone = len(inputs) == 1
         along = inputs[0] if alone else np.ones_like(inputs[0])
-        widest = max(len(along) // lines, 1) if lines and alone else 1
-        # The lowest ones alone, where G may change from line to line.
-        dense = min(_DENSE * widest, len(along))
-        starts = np.append(np.arange(dense), np.arange(dense, len(along), widest))
+        starts = np.arange(len(along))
+        if narrow and alone:  # a mode is as wide, over its frequency, as it is damped
+            _, starts = np.unique((narrow * np.log1p(starts / narrow)).astype(int), True)
         power = np.add.reduceat(np.abs(along) ** 2, starts)
         excited = power > 0
 

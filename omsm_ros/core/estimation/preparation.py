@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy import ndimage, signal
+from scipy import fft, ndimage, signal
 
 from omsm_ros.core.estimation.model_order import StartingPoints, fit
 from omsm_ros.core.estimation.model_structure import ScaledStructure
@@ -249,10 +249,11 @@ def faded_to_stationary(motion: FloatArray, moving: BoolArray, period: float) ->
 
 def input_bandwidth(motion: FloatArray, sample_period: float) -> float:
     """Return the frequency [Hz] below which 99 % of the energy of the velocity lies, with noise."""
-    power = np.abs(np.fft.rfft(np.diff(motion))) ** 2
+    length = fft.next_fast_len(len(motion), real=True)
+    power = np.abs(fft.rfft(np.diff(motion), length)) ** 2
     # Without a division: the power may be 0, also by underflow.
     place = int(np.searchsorted(np.cumsum(power), 0.99 * np.sum(power))) + 1
-    return float(place / (len(motion) * sample_period))
+    return float(place / (length * sample_period))
 
 
 def _static_gain(problem: Problem) -> float:

@@ -29,8 +29,7 @@ from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.residual_tests import noise_colour
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.core.model_errors.families import FASTEST_CREEP_S
-from omsm_ros.core.model_errors.residual_diagnostics import SPANNED
-from omsm_ros.linear_algebra import orthonormal
+from omsm_ros.linear_algebra import inverse_root
 
 # χ² that each column must explain to be significant: four sigma.
 _CLEARLY_SHOWN = 16.0
@@ -57,10 +56,11 @@ def has_initial_response(
     columns = problem.initial_condition_response(fitted)[problem.used]
     # The fit already contains the part of a decay that is collinear with its parameters.
     known = problem.sensitivity(fitted)
-    spanned = orthonormal(np.column_stack([columns, known]), SPANNED)
-    explained = float(np.sum((fitted.residual @ spanned) ** 2))
+    columns = np.column_stack([columns, known])
+    root = inverse_root(columns.T @ columns)
+    explained = float(np.sum(((fitted.residual @ columns) @ root) ** 2))
     rest = fitted.sum_of_squares - explained
-    size = spanned.shape[1] - known.shape[1]
+    size = root.shape[1] - known.shape[1]
     return bool(explained * fitted.samples > colour * _CLEARLY_SHOWN * max(size, 1) * rest)
 
 

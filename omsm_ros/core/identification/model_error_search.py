@@ -213,8 +213,13 @@ def _drift(prepared: Prepared, budget: EvaluationBudget) -> list[ScoreTest]:
     start, part = [np.array([0.1])], problem.sums
     lag = fit(problem, Structure(0, 0, True), start, budget=budget, part=part)
     diagnostics = ResidualDiagnostics(problem, lag, prepared.steps, (CREEP, DRIFT, LINEARITY))
-    shown = _select_nuisance_terms(diagnostics, diagnostics.significant())
-    return [judged for judged in shown if judged.term.family == DRIFT]
+    # If the decimated record shows none, all samples need not be tested.
+    for each in filter(None, (diagnostics.thinned, diagnostics)):
+        shown = _select_nuisance_terms(each, each.significant())
+        shown = [judged for judged in shown if judged.term.family == DRIFT]
+        if not shown:
+            break
+    return shown
 
 
 def _modelled_as_poles(
@@ -229,7 +234,7 @@ def _modelled_as_poles(
     rival = min((c.fit for c in model.candidates), key=information)
     diagnostics = ResidualDiagnostics(prepared.problem, best, prepared.steps, _NUISANCE_FAMILIES)
     fewer = diagnostics.thinned
-    # If the decimated record shows none, all samples need not be tested.
+    # The decimated record is tested first, as for drift.
     if fewer is not None:
         there = fewer.problem.evaluated(rival.structure, rival.nonlinear)
         if not _improving_terms(prepared, fewer, there, budget):

@@ -32,16 +32,22 @@ def frequency_response(
     Increments make steps and offsets stationary and cancel in the ratio. The uncertainty is
     that of Bendat and Piersol, √((1 - γ²) / (2 γ² n)), with n independent segments.
     """
-    du, dy = np.diff(motion), np.diff(output)
-    rate = 1 / sample_period
-    options = {"fs": rate, "nperseg": min(segment, len(du)), "detrend": False}
-    frequency, cross = scipy.signal.csd(du, dy, **options)
-    inward, outward = (scipy.signal.welch(each, **options)[1] for each in (du, dy))
+    samples, size = len(motion) - 1, min(segment, len(motion) - 1)
+    window, view = (
+        scipy.signal.windows.hann(size, sym=False),
+        np.lib.stride_tricks.sliding_window_view,
+    )
+    # Segments overlap by half; scipy.signal.csd transforms them one by one.
+    parts = (view(np.diff(each), size)[:: size - size // 2] for each in (motion, output))
+    u, y = (np.fft.rfft(part * window) for part in parts)
+    cross = np.sum(u.conj() * y, axis=0)
+    inward, outward = (np.sum(np.abs(each) ** 2, axis=0) for each in (u, y))
     tiny = np.finfo(np.float64).tiny
     coherence = np.abs(cross) ** 2 / np.maximum(inward * outward, tiny)
-    count = max(2 * len(du) / options["nperseg"] - 1, 1.0)
+    count = max(2 * samples / size - 1, 1.0)
     inside = np.clip(coherence, 1e-12, 1.0)
     uncertainty = np.sqrt((1 - inside) / (2 * inside * count))
+    frequency = np.asarray(np.fft.rfftfreq(size, sample_period))
     return FrequencyResponse(
         frequency, np.asarray(cross / np.maximum(inward, tiny)), coherence, uncertainty
     )

@@ -249,15 +249,28 @@ def fit_two_mass(
     def model(logs: FloatArray) -> TwoMass:
         return TwoMass(table_mass, *(float(v) for v in np.exp(logs)))
 
-    def residual(logs: FloatArray) -> FloatArray:
+    def polynomials(logs: FloatArray) -> list[tuple[ComplexArray, float]]:
         # A transfer function, which checks its coefficients, would take three times as long.
-        up, down = model(logs).polynomials(collocated=collocated)
-        found = polynomial.polyval(s, up) / polynomial.polyval(s, down)
-        difference = np.log(found * (down[0] / up[0])) - target
+        each = model(logs).polynomials(collocated=collocated)
+        return [(polynomial.polyval(s, one), one[0]) for one in each]
+
+    def residual(logs: FloatArray) -> FloatArray:
+        (up, up_0), (down, down_0) = polynomials(logs)
+        difference = np.log(up / down * (down_0 / up_0)) - target
         turned = np.angle(np.exp(1j * difference.imag))
         return np.asarray(whiten @ np.concatenate([difference.real, turned]))
 
-    best = _least(residual, _starts(oscillating, table_mass))
+    def slopes(logs: FloatArray) -> FloatArray:
+        # Each coefficient is linear in each of the five: doubled, one adds its derivative by ln.
+        (up, up_0), (down, down_0) = polynomials(logs)
+        rows = []
+        for each in logs + np.log(2) * np.eye(len(logs)):
+            (more_up, more_up_0), (more_down, more_down_0) = polynomials(each)
+            rows.append(more_up / up - more_up_0 / up_0 - more_down / down + more_down_0 / down_0)
+        both = np.concatenate([np.real(rows), np.imag(rows)], axis=1)
+        return np.asarray(whiten @ both.T)
+
+    best = _least(residual, slopes, _starts(oscillating, table_mass))
     spread = np.linalg.pinv(best.jac) @ whiten @ jacobian
     dof = max(np.count_nonzero(np.diag(covariance)) - len(FITTED), 1)
     misfit = np.sqrt(2 * best.cost / dof) if best.success else np.inf
@@ -265,15 +278,16 @@ def fit_two_mass(
 
 
 def _least(
-    residual: Callable[[FloatArray], FloatArray], starts: Sequence[FloatArray]
+    residual: Callable[[FloatArray], FloatArray],
+    slopes: Callable[[FloatArray], FloatArray],
+    starts: Sequence[FloatArray],
 ) -> "scipy.optimize.OptimizeResult":
     """Minimise the sum of squares from all ``starts`` briefly, then from the best to the end."""
 
     def descend(start: FloatArray, evaluations: int | None) -> "scipy.optimize.OptimizeResult":
         box = (start - _SEARCHED, start + _SEARCHED)
-        # Central differences, because the weights span a factor of 10⁴.
         return scipy.optimize.least_squares(
-            residual, start, jac="3-point", x_scale="jac", bounds=box, max_nfev=evaluations
+            residual, start, slopes, x_scale="jac", bounds=box, max_nfev=evaluations
         )
 
     raced = [descend(start, _RACE_EVALUATIONS) for start in starts]

@@ -419,11 +419,10 @@ class ModelErrorFamilies:
         if not self.steps.edges:
             return
 
-        def part(first: int, last: int) -> FloatArray:
-            lost = backlash_lead(turning(), _GAPS_M[first:last], _FINER)
-            return -self.fitted.gain * np.column_stack(list(lost))
-
-        yield ModelErrorFamily(BACKLASH, np.asarray(_GAPS_M), 2.0, part, 2)
+        # All at once, because they share the search for reversals.
+        rows = np.array(list(backlash_lead(turning(), _GAPS_M, _FINER)))
+        rows *= -self.fitted.gain
+        yield ModelErrorFamily.of(BACKLASH, np.asarray(_GAPS_M), 2.0, rows.T)
 
 
 def _vertex(power: FloatArray, peak: int) -> float:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy import fft, stats
@@ -30,6 +30,7 @@ from omsm_ros.core.model_errors.families import (
     DRIFT,
     FASTEST_MODE_HZ,
     FRICTION,
+    MODE,
     PERIODIC,
     VIBRATION,
     ModelErrorFamilies,
@@ -37,12 +38,12 @@ from omsm_ros.core.model_errors.families import (
     ModelErrorTerm,
 )
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
-from omsm_ros.linear_algebra import BLOCK_ROWS, BLOCK_VALUES, inverse_root, tall_svd, unit_columns
+from omsm_ros.linear_algebra import BLOCK_ROWS, BLOCK_VALUES, basis_and_inverse, inverse_root
 
 # A column with a weaker remainder is collinear with the fitted parameters but for rounding.
 _COLLINEAR_SHARE = 1e-4
 # Directions this much weaker than the strongest are rounding.
-SPANNED = 1e-9
+_SPANNED = 1e-9
 # Fewest lines over which noise is averaged: its level is then known to a quarter,
 _LEAST_LINES = 8
 # and the factor of frequency on either side where lines are dense, half an octave.
@@ -88,20 +89,12 @@ class ResidualSpace:
     @cached_property
     def _decomposed(self) -> tuple[FloatArray, FloatArray]:
         """A basis (k, r) of the columns of the parameters, and its parameters (p, r)."""
-        unit, scale = unit_columns(self.problem.sensitivity(self.fitted))
-        left, values, right = tall_svd(unit)
-        kept = values > SPANNED * values[0]
-        return left[:, kept], right[kept].T / values[kept] / scale[:, np.newaxis]
+        return basis_and_inverse(self.problem.sensitivity(self.fitted), _SPANNED)
 
     def collinear_parameters(self, column: FloatArray) -> FloatArray:
         """Return the parameters (p,) nearest to ``column`` (n,) over the compared samples."""
         basis, parameters = self._decomposed
         return np.asarray(parameters @ (basis.T @ column[self.problem.used]))
-
-    def _compared(self, columns: FloatArray) -> FloatArray:
-        """Return those of ``columns`` (n, c) that are compared, (k, c), each in one piece."""
-        rows = columns.T[:, self.problem.kept]
-        return (rows if rows.strides[1] == rows.itemsize else np.ascontiguousarray(rows)).T
 
     def _free(self, rows: FloatArray) -> None:
         kept = self.problem.kept
@@ -115,15 +108,14 @@ class ResidualSpace:
 
         It finds the best of many terms; :meth:`score` then tests it.
         """
-        compared = self._compared(columns)
-        collinear = (self._basis.T @ compared).reshape(self._basis.shape[1], -1, terms)
-        moment = (compared.T @ self.fitted.residual).reshape(-1, terms)
-        gram = np.empty((len(moment), terms, terms))
-        for i in range(terms):
-            for j in range(i + 1):
-                both = np.einsum("kg,kg->g", compared[:, i::terms], compared[:, j::terms])
-                both -= np.einsum("kg,kg->g", collinear[..., i], collinear[..., j])
-                gram[:, i, j] = gram[:, j, i] = both
+        compared = columns.T[:, self.problem.kept]
+        if compared.strides[1] != compared.itemsize:  # each in one piece
+            compared = np.ascontiguousarray(compared)
+        moment = (compared @ self.fitted.residual).reshape(-1, terms)
+        whole, collinear = (
+            rows.reshape(len(moment), terms, -1) for rows in (compared, compared @ self._basis)
+        )
+        gram = whole @ whole.transpose(0, 2, 1) - collinear @ collinear.transpose(0, 2, 1)
         inverse = np.linalg.pinv(gram, rcond=_COLLINEAR_SHARE, hermitian=True)
         explained = np.einsum("gi,gij,gj->g", moment, inverse, moment)
         return np.asarray(explained / (self.fitted.sum_of_squares / self.fitted.samples))
@@ -215,14 +207,20 @@ def smoothed_noise_spectrum(
     on_grid = np.zeros(samples)
     on_grid[place] = residual
     power = np.abs(fft.rfft(on_grid, length)) ** 2 / len(residual)
-    line = np.arange(len(power))
-    low = np.minimum(line / _HALF_WIDTH, line - _LEAST_LINES / 2).astype(int)
-    low = np.clip(low, 1, max(len(power) - _LEAST_LINES, 1))
-    high = np.maximum(line * _HALF_WIDTH, low + _LEAST_LINES).astype(int)
-    high = np.minimum(high, len(power))
+    low, high = _octaves(len(power))
     total = np.concatenate([[0.0], np.cumsum(power)])
     smooth = (total[high] - total[low]) / np.maximum(high - low, 1)
     return np.asarray(np.maximum(smooth, noise_spectrum(residual, length)))
+
+
+@lru_cache(maxsize=2)
+def _octaves(lines: int) -> tuple[IntArray, IntArray]:
+    """Return the first of ``lines`` lines near each, and the end of those near it."""
+    line = np.arange(lines)
+    low = np.minimum(line / _HALF_WIDTH, line - _LEAST_LINES / 2).astype(int)
+    low = np.clip(low, 1, max(lines - _LEAST_LINES, 1))
+    high = np.maximum(line * _HALF_WIDTH, low + _LEAST_LINES).astype(int)
+    return low, np.minimum(high, lines)
 
 
 # Probability of a false alarm of one family; that of ten families is 1e-3.
@@ -335,7 +333,9 @@ class ResidualDiagnostics:
         may be fast, or where rounding is shared by the readings of a plateau.
         """
         problem, steps = self.problem, self.steps
-        fastest = max(problem.rate / (2 * np.pi), FASTEST_MODE_HZ)
+        fastest = problem.rate / (2 * np.pi)
+        if not self.only or MODE in self.only:
+            fastest = max(fastest, FASTEST_MODE_HZ)
         per_content = 0.5 / (problem.period * fastest * ABOVE_CONTENT)
         every = int(min(len(problem.input) / ENOUGH_SAMPLES, per_content))
         rests = bool(steps.edges) and float(np.mean(steps.moving)) < _MOSTLY
@@ -361,16 +361,15 @@ class ResidualDiagnostics:
         """Return the p-value of the correlation of the residual with the rate of the motion."""
         rate = np.concatenate([np.zeros(LAGS - 1), np.gradient(self.problem.motion)])
         # The last values of the rate, the newest last, 0 before the record.
-        past = np.lib.stride_tricks.sliding_window_view(rate, LAGS)
-        parts = range(0, len(past), BLOCK_ROWS)
-        rows = (np.ascontiguousarray(past[i : i + BLOCK_ROWS]) for i in parts)
-        gram = np.sum([part.T @ part for part in rows], axis=0)
-        mixed = inverse_root(gram)
+        past = np.lib.stride_tricks.sliding_window_view(rate, len(rate) - LAGS + 1)
+        parts = [slice(i, i + BLOCK_ROWS) for i in range(0, past.shape[1], BLOCK_ROWS)]
+        rows = (np.ascontiguousarray(past[:, part]) for part in parts)
+        mixed = inverse_root(np.sum([each @ each.T for each in rows], axis=0)).T
         if not mixed.size:
             return 1.0
-        columns = np.empty((mixed.shape[1], len(past)))
-        for first in parts:
-            columns[:, first : first + BLOCK_ROWS] = (past[first : first + BLOCK_ROWS] @ mixed).T
+        columns = np.empty((len(mixed), past.shape[1]))
+        for part in parts:
+            columns[:, part] = mixed @ np.ascontiguousarray(past[:, part])
         return float(np.exp(self.space.judged(columns).log_p))
 
     def significant(self, but: Collection[str] = ()) -> list[ScoreTest]:

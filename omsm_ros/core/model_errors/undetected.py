@@ -105,7 +105,8 @@ def undetected_terms(
     drift: columns of the background that model a drift;  use: the scans to be corrected
     """
     # Only the relaxations are tested again, up to slower ones.
-    slow = with_slow_creep(diagnostics.thinned or diagnostics)
+    slow = replace(diagnostics, only=(CREEP,))
+    slow = with_slow_creep(slow.thinned or slow)
     relaxations = [_undetected_terms(slow, judged, use) for judged in slow.creep]
     steady = [_STEADY_DRIFT]
     for gone in [steady, drift, [*steady, *drift]] if drift else [steady]:
