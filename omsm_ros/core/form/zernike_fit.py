@@ -392,7 +392,7 @@ def _group_sums(
     followed = np.add.reduceat(products, begins, axis=1)
     sums = followed
     for _ in range(_FOLLOWED):
-        along = np.sum(np.repeat(inverse @ followed, sizes, axis=1) * columns, axis=0)
+        along = np.einsum("kn,kn->n", np.repeat(inverse @ followed, sizes, axis=1), columns)
         followed = np.add.reduceat(weighted * along, begins, axis=1)
         sums = sums + followed
     return np.asarray(sums, np.float64)
