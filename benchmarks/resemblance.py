@@ -37,7 +37,8 @@ class Drawn:
         self.covariance, self.term_covariance = form.covariance, form.term_covariance
         self.every, self.by_height = figures._term_fit(self.solution, self.made.places)
         self.kept = [self.every.index(t) for t in form.terms]
-        self.root = np.linalg.cholesky(form.covariance + 1e-24 * np.eye(len(form.x)))
+        share, axes = np.linalg.eigh(form.covariance)
+        self.root = axes * np.sqrt(np.maximum(share, 0.0))
 
     def errors(self) -> dict[str, list[tuple[str, np.ndarray]]]:
         """Return each error of the table: its sizes, and what they do to the heights [m]."""

@@ -363,13 +363,11 @@ def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Sol
     for one in (evidence_of(solution, f) for f in solution.network.families if f.named):
         name = one.family.name
         if one.declared:
-            ratio = one.chi_square / max(one.dof, 1)
-            sizes[name] = np.sqrt(max(ratio, 1.0)) * sizes[name]
+            sizes[name] = np.sqrt(max(one.chi_square / max(one.dof, 1), 1.0)) * sizes[name]
             continue
         probable = 1 / (1 + ODDS_ABSENT * np.exp(-min(one.gain, SURE) / 2))
         root = np.sqrt(max(probable, _LEAST_PROBABLE))
-        size = root * np.hypot(one.values, one.uncertainty)
-        sizes[name] = np.minimum(size, one.family.wide)
+        sizes[name] = np.minimum(root * np.hypot(one.values, one.uncertainty), one.family.wide)
     for refutation in refutations:
         for other in refutation.rivals:
             share = explained(other, refutation.evidence)
