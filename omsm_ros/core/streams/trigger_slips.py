@@ -6,11 +6,10 @@ distance at equal counts; after a slip it is a whole number of sample periods.
 
 The median skew of about a second is judged every 0.2 s. A slip begins at ``|median| >= period / 2 +
 tolerance + 3 scatter`` and ends at ``|median| < period / 2 + tolerance``. Between the two limits
-the last verdict holds. Before the first verdict the pairs wait; after ten seconds it is a slip. A
-start has none after a second if its stamps have ``|median| + 3 scatter < period / 2``. The scatter
-is that of the second, or of the last half minute if it is larger, because a driver's clock wanders
-while it is estimated from arrivals. The movement of that estimate bounds its error: the earliest of
-n arrivals is late by about 1/n of their scatter, the earliest of n/k by k/n of it.
+the last verdict holds. Before the first verdict the pairs wait; after ten seconds it is a slip. The
+scatter is that of the second, or of the last half minute if it is larger, because a driver's clock
+wanders while it is estimated from arrivals. The movement of that estimate bounds its error: the
+earliest of n arrivals is late by about 1/n of their scatter, the earliest of n/k by k/n of it.
 
 A difference of the delays of two devices of half a period or more compensates a slip. So a median
 that differs from the usual one by ``period / 2 + 3 scatter`` is a slip, too.
@@ -40,7 +39,7 @@ from omsm_ros.units import NANOSECONDS_PER_S
 
 # Stamps of a driver are within 0.1 ms of the truth after 10 s (devices/clock.py); two drivers.
 TWO_DRIVERS_S = 0.2e-3
-# The first stamps of a driver are as uneven as its first arrivals: alone they are not judged [s].
+# The first stamps of a driver are as uneven as its first arrivals: they are not judged [s].
 _FIRST_S = 1.0
 # Length of the judged median, and time between verdicts. A slip is found after half to all of
 # the span [s].
@@ -270,7 +269,6 @@ class TriggerSlipDetector:
         if stride != judged:
             if not early_days:
                 self._since = count - _SPAN_S * per_s
-                self._starting = self._starting and (self.in_doubt or not self._clearly_agrees())
                 self._judge(count)
             if not self._state.samples:  # a slip in the newest ones is not found yet
                 self._wander.append(skew)
@@ -279,14 +277,6 @@ class TriggerSlipDetector:
         time = axes.stamp_of(a, count, period_ns) or 0.0
         self._seen.add(count, skew, *begun, time)
         self._odd |= off and not early_days
-
-    def _clearly_agrees(self) -> bool:
-        """Return whether all stamps since the start show no slip, however late clocks still are."""
-        if min(self._stamps) < _LEAST_STAMPS:
-            return False
-        skew = self._seen.rows[:, 1]
-        most = abs(median(skew[-_LEAST_STAMPS:])) + _SEVERAL_TIMES * _scatter(skew)
-        return most < self._period_ns / 2 and self._seen.stamps_follow_counts(self._period_ns)
 
     def _off(self, skew: FloatArray) -> BoolArray:
         """Return which ``skew`` (n,) of single stamps [ns] may be of a slip."""
