@@ -281,7 +281,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         own, passed_on = _split(given)
         named = [a for a in own if a in WORDS][:1]
         if not named and (near := difflib.get_close_matches(own[0], WORDS, 1)):
-            raise UsageError(f"{own[0]!r}: unknown command, did you mean {near[0]!r}?")
+            raise UsageError(
+                f"{own[0]!r}: unknown command, did you mean {near[0]!r}? see 'omsm --help'"
+            )
         args = parser_of(named).parse_args(own)
         args.passed_on = passed_on
         return _run(args, own)

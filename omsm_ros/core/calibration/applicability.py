@@ -76,7 +76,8 @@ def _certificate(calibration: Calibration, polarity: int | None) -> list[Notice]
         found.append(Notice("calibration.was_rejected", reasons=f" ({reasons})" if reasons else ""))
     certified = certificate.static_gain.polarity
     if polarity is not None and certified is not None and certified != polarity:
-        code = f"calibration.other_polarity_{'rises' if certified == -1 else 'falls'}"
+        rises, falls = "calibration.other_polarity_rises", "calibration.other_polarity_falls"
+        code = rises if certified == -1 else falls
         found.append(Notice(code, polarity=polarity, certified=certified))
     return found
 
