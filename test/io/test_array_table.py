@@ -77,3 +77,9 @@ def test_an_array_alone_is_mapped(tmp_path):
         stream.truncate(5000)
     with pytest.raises(FileError, match="cannot be read"):
         ArrayTable(tmp_path / "a.npy")
+
+
+def test_a_name_of_two_arrays_stands_twice_so_that_it_is_refused(tmp_path):
+    write_npz(tmp_path / "a.npz", **{"p": np.ones((5, 2)), "p[0]": np.zeros(5)})
+    assert sorted(ArrayTable(tmp_path / "a.npz").names) == ["p[0]", "p[0]", "p[1]"]
+    assert np.all(columns_of(tmp_path / "a.npz", "p[1]")["p[1]"] == 1.0)

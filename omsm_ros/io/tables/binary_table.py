@@ -56,7 +56,6 @@ _MAX_COLUMNS = 1000
 _AGAIN = "write it again, or as CSV"
 
 _MATLAB_PACKED = 15  # miCOMPRESSED of "MAT-File Format"
-_INDEXED = re.compile(r"(.*)\[(\d{1,4})\]")
 
 
 class ArrayTable(ForeignTable):
@@ -73,18 +72,17 @@ class ArrayTable(ForeignTable):
         if size > _MAX_WHOLE_BYTES and read != self._hdf5:
             raise FileError(f"{self} has {size} bytes, at most {_MAX_WHOLE_BYTES}; split it")
         with library_errors(str(self), _AGAIN):
-            self._arrays = {micro_sign(name): array for name, array in _flat("", read())}
-        for name, array in self._arrays.items():
-            self._name(name, array)
-
-    def _name(self, name: str, array: Any) -> None:
-        if array.dtype.kind not in "fiu":
-            return
-        if array.ndim == 1:
-            self.names.append(name)
-        elif array.ndim == 2:
-            columns = range(min(array.shape[1], _MAX_COLUMNS))
-            self.names += [f"{name}[{column}]" for column in columns]
+            arrays = {micro_sign(name): array for name, array in _flat("", read())}
+        self._columns: dict[str, tuple[Any, int | None]] = {}
+        for name, array in arrays.items():
+            found: dict[str, tuple[Any, int | None]] = {}
+            if array.dtype.kind in "fiu" and array.ndim == 1:
+                found = {name: (array, None)}
+            elif array.dtype.kind in "fiu" and array.ndim == 2:
+                columns = range(min(array.shape[1], _MAX_COLUMNS))
+                found = {f"{name}[{column}]": (array, column) for column in columns}
+            self._columns |= found
+            self.names += found  # a name that two arrays give stands twice
 
     def _numpy(self) -> Mapping[str, Any]:
         with open_regular(self.path, FileError, "table") as stream:
@@ -158,7 +156,7 @@ class ArrayTable(ForeignTable):
             raise FileError(
                 f"{self} has numbers, no dates, in {sorted(dates)}; give them another unit"
             )
-        views = {name: self._view(name) for name in names}
+        views = {name: self._columns[name] for name in names}
         lengths = {name: len(array) for name, (array, _) in views.items()}
         if len(set(lengths.values())) > 1:
             raise FileError(f"{self} has columns of different lengths {lengths}; cut them alike")
@@ -168,13 +166,6 @@ class ArrayTable(ForeignTable):
                 name: np.asarray(array[rows] if column is None else array[rows, column], np.float64)
                 for name, (array, column) in views.items()
             }
-
-    def _view(self, name: str) -> tuple[Any, int | None]:
-        if name in self._arrays:
-            return self._arrays[name], None
-        indexed = _INDEXED.fullmatch(name)
-        assert indexed is not None  # it is one of self.names
-        return self._arrays[indexed[1]], int(indexed[2])
 
 
 class _Row:
