@@ -49,8 +49,8 @@ def _left(solution: Solution, view: ScanView) -> FloatArray:
 def dust_of(solution: Solution, views: Sequence[ScanView]) -> list[tuple[IntArray, FloatArray]]:
     """Return by scan which points are dust, as a registration finds it, and how high [m].
 
-    What the tracks of one scan do not confirm is narrower than they are apart. The map does not
-    resolve it, so that far points of another scan at the same place are left out, too.
+    A point that the tracks of one scan do not confirm is narrower than they are apart. The map does
+    not resolve it, so that far points of another scan at the same place are left out, too.
     """
     found, dust, reach = [], [np.empty((0, 2))], 0.0
     for view in views:
