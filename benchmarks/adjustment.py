@@ -139,38 +139,38 @@ def adjusted(world: World, plan: Sequence[tuple[float, str, float]]) -> Adjustme
     return adjust(data, priors, calibration=calibration, nominal=PAPER_MIRROR, removed=REMOVED)
 
 
-def true_figures(world: World) -> tuple[float, float]:
-    """Return PV and rms of the part's deviation along Z, the pose ``REMOVED`` taken away [m]."""
+def _true_form(world: World, radius: float) -> tuple[np.ndarray, ...]:
+    """Return x, y [m], share of the area, and the part's deviation along Z within ``radius`` [m],
+    the pose ``REMOVED`` taken away [m]; the rim has no area."""
     nodes, weights = np.polynomial.legendre.leggauss(160)
-    radius, angle = np.sqrt((nodes + 1) / 2), 2 * np.pi * np.arange(360) / 360
-    # The rim has no area: its points count for the PV alone.
-    r = world.radius * np.append(radius, 1.0)[:, np.newaxis]
+    root, angle = np.sqrt((nodes + 1) / 2), 2 * np.pi * np.arange(360) / 360
+    r = radius * np.append(root, 1.0)[:, np.newaxis]
     x, y = (r * np.cos(angle)).ravel(), (r * np.sin(angle)).ravel()
     area = np.repeat(np.append(weights / (2 * len(angle)), 0.0), len(angle))
     height = world.part.deviation(x, y)
     along_x, along_y = slopes(world.nominal.height, x, y)
     pose = np.stack([np.ones(len(x)), x, y, along_x, along_y, along_x * y - along_y * x], axis=1)
     pose /= np.max(np.abs(pose), axis=0)
-    root = np.sqrt(area)
-    fitted = np.linalg.lstsq(pose * root[:, np.newaxis], height * root, rcond=1e-9)[0]
-    left = height - pose @ fitted
+    weight = np.sqrt(area)
+    fitted = np.linalg.lstsq(pose * weight[:, np.newaxis], height * weight, rcond=1e-9)[0]
+    return x, y, area, height - pose @ fitted
+
+
+def true_figures(world: World) -> tuple[float, float]:
+    """Return PV and rms of the part's deviation along Z, the pose ``REMOVED`` taken away [m]."""
+    _, _, area, left = _true_form(world, world.radius)
     return float(np.ptp(left)), float(np.sqrt(area @ left**2))
 
 
 def _terms_against_truth(world: World, form: FormMap) -> list[tuple[float, float]]:
     """Return error and standard uncertainty of each term of degree 2 to 4, as rms [m]."""
+    x, y, area, true = _true_form(world, form.disc.radius)
     terms = terms_up_to(8)
-    values = zernike_values(*form.disc.scaled(form.x, form.y), terms).T
+    values = zernike_values(*form.disc.scaled(x, y), terms).T
     kept = [k for k, term in enumerate(terms) if term in form.terms]
-    root = np.sqrt(form.area)[:, np.newaxis]
-    along_x, along_y = slopes(world.nominal.height, form.x, form.y)
-    pose = np.stack([np.ones(len(form.x)), form.x, form.y, along_x, along_y,
-                     along_x * form.y - along_y * form.x], axis=1)  # fmt: skip
-    pose /= np.max(np.abs(pose), axis=0)
-    true = world.part.deviation(form.x, form.y)
-    true = true - pose @ np.linalg.lstsq(pose * root, true * root[:, 0], rcond=1e-9)[0]
-    fitted = (np.linalg.pinv(values * root, rcond=1e-6) @ (root[:, 0] * true))[kept]
-    size = np.sqrt(form.area @ values[:, kept] ** 2)
+    root = np.sqrt(area)
+    fitted = np.linalg.lstsq(values * root[:, np.newaxis], root * true, rcond=1e-6)[0][kept]
+    size = np.sqrt(area @ values[:, kept] ** 2)
     spread = np.sqrt(np.maximum(np.diag(form.term_covariance), 0.0))
     return list(zip(size * (form.coefficients - fitted), size * spread, strict=True))
 

@@ -117,8 +117,7 @@ def form_map(
     open_changes = made.open_changes(doubts)
     spread = solution.factor.forward(made.rows[:, solution.active].T)
     raw = spread.T @ spread
-    of_cells = made.member @ scipy.sparse.diags_array(made.share) @ made.member.T
-    raw += of_cells.toarray()
+    raw += (made.member @ scipy.sparse.diags_array(made.share) @ made.member.T).toarray()
     covariance = made.free(made.free(raw).T)
     covariance += open_changes @ open_changes.T
     every, by_height = _term_fit(solution, places)
@@ -457,7 +456,8 @@ def _reported(
     made = FormOf.of(solution, form.nominal, form.removed, nodes_of(solution))
     every, fit = _term_fit(solution, made.places)
     kept = [k for k, t in enumerate(every) if 2 <= t.n <= REPORTED_DEGREE]
-    fit = fit[kept]
+    # A pose that is removed is no uncertainty: decentre looks like astigmatism.
+    fit = fit[kept] - fit[kept] @ made.columns @ made.fit
     spread = solution.factor.forward((fit @ made.rows[:, solution.active]).T)
     of_cells = (fit @ made.member) * np.sqrt(made.share)
     changes = fit @ made.open_changes(doubts)
