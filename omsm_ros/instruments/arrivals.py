@@ -434,13 +434,14 @@ class _Reference:
 
         Arrivals after them are expected earlier from then on.
 
-        locked: a change by a period may be one of the age, so arrivals have to stay on the line
+        locked: a change by a period may be one of the age, so one for a short time is excluded, too
         """
         begin, late = np.array(self._earliest).T
         since, periods = begin - begin[-1], late / self._period
 
-        def shifted(at: int, missed: float) -> tuple[float, FloatArray]:
-            moved = np.append(periods[:at], periods[at:] - missed)
+        def shifted(at: int, missed: float, end: int | None = None) -> tuple[float, FloatArray]:
+            moved = periods.copy()
+            moved[at:end] -= missed
             return _likelihood(since, moved, self._period)
 
         none, rest = shifted(0, 0)
@@ -462,8 +463,9 @@ class _Reference:
             self.expect_missed(best, float(begin[at]))
             return best
         seen = np.max([*likely.values()], axis=0) < -_EXCLUDED
-        off = sliding_window_view(rest, _SHOWING).min(axis=1).max() if locked else 0.0
-        sure = most < _POSSIBLE and off <= _AGE_PERIODS and seen[-_OPEN:].any()
+        off = np.flatnonzero(sliding_window_view(rest, _SHOWING).min(axis=1) > _AGE_PERIODS)
+        aged = (shifted(first, 1, first + _SHOWING)[0] - none > -_EXCLUDED for first in off)
+        sure = most < _POSSIBLE and not (locked and any(aged)) and seen[-_OPEN:].any()
         return 0 if sure and np.count_nonzero(~seen[:-_OPEN]) <= _UNSEEN * len(late) else None
 
     def _set_line(self, known: int) -> None:

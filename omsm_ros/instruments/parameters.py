@@ -122,7 +122,6 @@ AXIS_PARAMETERS = (
     Parameter("columns", USUAL_COLUMNS, _COLUMNS),
 )
 
-
 _CONVERTER = "daq://Dev1/ai0:2?range=10&clock=PFI0, or synthetic://?frequency=680&amplitude=0.01"
 
 REFERENCE_PARAMETERS = (

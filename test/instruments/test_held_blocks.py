@@ -6,8 +6,10 @@ import struct
 from contextlib import suppress
 
 import numpy as np
+import pytest
 
 from omsm_ros.errors import DeviceError
+from omsm_ros.instruments.arrivals import MissedTriggerDetector
 from omsm_ros.instruments.micro_epsilon.capancdt_device import CapaNcdtDevice, CapaNcdtSettings
 from omsm_ros.instruments.micro_epsilon.protocol import MeasurementBlock, encode_block
 from omsm_ros.instruments.scaling import ProbeReading
@@ -78,3 +80,21 @@ def test_a_flipped_bit_in_the_header_of_a_block_makes_no_wrong_sample() -> None:
         counts = np.concatenate([b.distance for b in found]) / 1e-4 * 0xFFFFFF
         np.testing.assert_allclose(counts, 1000.0 + numbers)
         assert len(numbers) >= 32
+
+
+@pytest.mark.parametrize("missed", [0, 1])
+@pytest.mark.parametrize("seed", [0, 2, 4])
+def test_a_start_with_blocks_of_a_hundred_triggers_is_confirmed(seed: int, missed: int) -> None:
+    """Of ten arrivals in a second, three in a row are often late, but not by a whole period."""
+    random, detector, period = np.random.default_rng(seed), MissedTriggerDetector(1e-3), 1e-3
+    confirmed = []
+    for block in range(1, 100):
+        taken = block * 100 * period
+        due = taken - missed * period * (taken > 7.0)
+        if detector.confirms(due, 1000 + taken * (1 + 2e-5) + random.exponential(3e-4)):
+            confirmed.append(taken)
+        assert detector.forget_missed() == 0
+    assert confirmed
+    assert confirmed[0] < 7.0
+    assert confirmed[-1] > 9.0 or missed
+    assert confirmed[-1] < 7.1 or not missed

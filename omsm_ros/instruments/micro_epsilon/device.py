@@ -53,7 +53,6 @@ SKIPPED_VALUES = "-"
 _INFORMATION = rb"Serial|E\d\d"
 _KILOHERTZ = 1000.0
 
-
 # With this number of distances in a portion, chance does not put all of them before the range.
 _MANY_VALUES = 5
 COUNTER_RANGE = 2**32
