@@ -36,20 +36,18 @@ def autoregression(
         length = 2 * len(leverage) - 2
         power = np.abs(fft.rfft(residual, length)) ** 2 / np.maximum(1 - leverage, _LEAST_LEFT)
         lags = np.asarray(fft.irfft(power, length)[: highest + 1] / n)
-    coefficients: FloatArray = np.ones(1)
-    variance = float(lags[0])
+    coefficients, variance = np.append(1.0, np.zeros(highest)), float(lags[0])
     if variance <= 0:
-        return coefficients, 0.0
-    best = (n * np.log(variance), coefficients, variance)
+        return coefficients[:1], 0.0
+    best, price = (n * np.log(variance), coefficients[:1].copy(), variance), np.log(n)
     for order in range(1, highest + 1):
         # Levinson's recursion.
-        reflection = -float(coefficients @ lags[order:0:-1]) / variance
-        padded = np.append(coefficients, 0.0)
-        coefficients = padded + reflection * padded[::-1]
+        reflection = -float(coefficients[:order] @ lags[order:0:-1]) / variance
+        coefficients[: order + 1] += reflection * coefficients[order::-1]
         variance *= 1 - reflection**2
-        score = n * np.log(variance) + order * np.log(n)
+        score = n * np.log(variance) + order * price
         if score < best[0]:
-            best = (score, coefficients, variance)
+            best = (score, coefficients[: order + 1].copy(), variance)
     return np.asarray(best[1]), best[2]
 
 

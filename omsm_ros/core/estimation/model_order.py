@@ -73,8 +73,7 @@ def information(fit: Fit, colour: float = 1.0) -> float:
     """Return the Bayesian information criterion, -2 log likelihood + colour · size · log n.
 
     colour: power of the noise at low frequency over its mean. By chance a parameter of slow
-        dynamics
-        explains that much more of coloured noise, so its penalty is that much higher.
+        dynamics explains that much more of coloured noise, so its penalty is that much higher.
     """
     n = fit.samples
     floor = float(np.finfo(np.float64).tiny)
@@ -216,14 +215,17 @@ def fit(
         first = min(ends, key=lambda end: float(end.residual @ end.residual))
         ends = [descend(project, first, box, _FINISH_EVALUATIONS)]
     best = min(map(compared, ends), key=lambda found: found.sum_of_squares)
+    gain = part.sum_of_squares - best.sum_of_squares if part else np.inf
     evaluations = _FINISH_EVALUATIONS
     for _ in range(REFILLED):
+        # The next one would gain at most the share of the period that is not compared.
+        next_gain = gain * (1 - best.samples / problem.closed_length)
+        if next_gain * best.samples < least_gain * best.sum_of_squares:
+            break
         now = problem if lines is None else lines.filled(best)
         found = compared(descend(project, project(best.nonlinear), box, evaluations))
         gain, best = best.sum_of_squares - found.sum_of_squares, found
-        # The next one would gain at most the share of the period that is not compared.
-        next_gain = gain * (1 - best.samples / problem.closed_length)
-        if lines is None or next_gain * best.samples < least_gain * best.sum_of_squares:
+        if lines is None:
             break
         evaluations = _RACE_EVALUATIONS
     return best if lines is None or part else problem.evaluated(structure, best.nonlinear)
@@ -267,22 +269,21 @@ class StartingPoints:
         """Return the poles (n,) by iterated linear least squares (Sanathanan and Koerner 1963)."""
         # The line at s = 0 determines the background only; at both ends s may be extreme.
         inside = slice(1, max(len(self.problem.s) - 1, 2))
-        s = self.problem.s[inside, np.newaxis]
+        s = self.problem.s[inside]
         probe = self.problem.without_background(self.pure_delay)[inside]
-        powers = np.vander(s[:, 0], structure.poles + 1, increasing=True)
-        downs = -powers[:, 1:] * probe[:, np.newaxis]
+        powers = np.ascontiguousarray(np.vander(s, structure.poles + 1, increasing=True).T)
         ups = [
-            powers[:, :count] * (spectrum[inside, np.newaxis] * np.exp(-delay * s))
+            powers[:count] * (spectrum[inside] * np.exp(-delay * s))
             for spectrum, count in self.problem.drives(structure)
         ]
-        every = np.concatenate([downs, *ups], axis=1)
+        every = np.concatenate([-powers[1:] * probe, *ups, probe[np.newaxis]])
         poles = np.full(structure.poles, -1.0, np.complex128)
         for _ in range(_LINEAR_ITERATIONS):
-            weight = 1 / np.abs(np.prod(1 - s / poles, axis=1))
-            columns = every * weight[:, np.newaxis]
+            weight = 1 / np.abs(np.prod(1 - s * (1 / poles)[:, np.newaxis], axis=0))
             # Products of columns suffice for a start.
-            gram, moment = columns.conj().T @ columns, columns.conj().T @ (probe * weight)
-            solved = inverse_gram(gram.real) @ moment.real
+            rows = (every * weight).view(np.float64)
+            products = rows @ rows.T
+            solved = inverse_gram(products[:-1, :-1]) @ products[:-1, -1]
             denominator = np.concatenate([np.ones(1), solved[: structure.poles]])
             found = _stable(ascending_roots(denominator))
             if len(found) != structure.poles:

@@ -426,6 +426,8 @@ class RandomWalk:
 
     def shows(self, residual: FloatArray) -> bool:
         """Return whether ``residual`` (n,), 0 where not compared, walks (Schwarz 1978)."""
+        if not len(self.ratios):  # the fit follows all block means
+            return False
         likelihood, *_ = self._likelihood(residual, np.empty((0, len(residual))))
         return bool(2 * np.max(likelihood - likelihood[0]) > np.log(len(self.ratios)))
 

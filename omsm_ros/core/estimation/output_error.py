@@ -364,6 +364,7 @@ class CompressedProblem:
     inputs: of each input (m, k) at s (k,);  fixed: of the background, (q, 2k + q + 1)
     target: of the output, (2k + q + 1,); the last q + 1 are of the rest
     filled: returns it with the output as another fit has it where it is not compared
+    sum_of_squares: of the residual of the fit with which it is filled
     """
 
     rate: float
@@ -372,6 +373,7 @@ class CompressedProblem:
     fixed: FloatArray
     target: FloatArray
     filled: Callable[[Fit], CompressedProblem]
+    sum_of_squares: float
 
     @classmethod
     def of(cls, problem: Problem, narrow: int = 0) -> CompressedProblem:
@@ -413,7 +415,8 @@ class CompressedProblem:
             values, turn = np.linalg.eigh(rest / np.outer(scale, scale))
             rest = scale[:, np.newaxis] * turn * np.sqrt(np.maximum(values, 0.0))
             every = np.column_stack([every, rest])
-            return cls(problem.rate, s, coordinates, every[:-1], every[-1], filled)
+            known = fitted.sum_of_squares
+            return cls(problem.rate, s, coordinates, every[:-1], every[-1], filled, known)
 
         return filled(static)
 

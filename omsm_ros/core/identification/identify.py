@@ -203,11 +203,7 @@ def _evidence(
 ) -> IdentificationEvidence:
     """Return what the checks use: the uncertainty of the response, and what it consists of."""
     prepared, model, limits = searched.prepared, searched.model, DEFAULT_LIMITS
-    drift = [
-        nuisance_terms.columns
-        for nuisance_terms in searched.nuisance_terms
-        if nuisance_terms.term.family == DRIFT
-    ]
+    drift = [added.columns for added in searched.nuisance_terms if added.term.family == DRIFT]
     best, diagnostics = model.chosen.fit, searched.diagnostics
     further, undetected = undetected_covariance(diagnostics, priors, drift, use)
     further += [

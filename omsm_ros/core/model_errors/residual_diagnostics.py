@@ -146,7 +146,7 @@ class ResidualSpace:
         if self._walk is not None and family != DRIFT:
             walk, explained = self._walk.variance(self._residual, rows)
         spread = inverse @ self._noise_of(rows, found, walk) @ inverse.T
-        chi_square = float(found @ np.linalg.pinv(spread, rcond=1e-9, hermitian=True) @ found)
+        chi_square = float(np.sum((found @ inverse_root(spread, _SPANNED)) ** 2))
         size[free] = found / unit
         covariance[np.ix_(free, free)] = spread / np.outer(unit, unit)
         # Rounding that is common to a plateau would count as a walk, which the rows explain.

@@ -37,6 +37,15 @@ class TestImperfectData:
             PAPER_STATIC_GAIN * 100e-9 / 60, rel=0.5
         )
 
+    def test_a_probe_in_range_for_a_moment_only_is_rejected(self):
+        """Two hundred readings of a step test: fewer means over blocks than a fit has columns."""
+        recording = recorded(seed=12)
+        distance = recording.distance.distance.copy()
+        distance[:2950] = distance[3150:] = np.nan
+        certificate = identify(record_of(recording, distance=distance)).calibration.certificate
+        assert certificate.residual.samples["compared"] == 200
+        assert certificate.verdict == "rejected"
+
     def test_coloured_noise_widens_the_band(self):
         recording = recorded(seed=12)
         noise = np.random.default_rng(3).normal(0, 5e-9, len(recording.axes))
