@@ -29,7 +29,9 @@ _LONG = 3
 # Events of one defect differ in size by less than this factor, unless there is little dust that may
 # meet by chance; reaches between them, with the factor for events that are farther apart.
 _SIMILAR = 2.0
-_SCALES = ((3.0, 1.2), (1.0, np.inf), (1.0, _SIMILAR))
+_SCALES = ((6.0, 1.2), (3.0, 1.2), (1.0, np.inf), (1.0, _SIMILAR))
+# Most similar events that one has about it by chance, where those farthest apart are compared.
+_MOST_MEETING = 0.25
 # A point of a defect is dust beyond this multiple of the usual size of this number of neighbours.
 _DENSE, _AROUND = 1.5, 16
 # A point little beyond the limit is form if this share of the points around is half as far; noise
@@ -286,9 +288,13 @@ def _confirmed(
     form = np.zeros(len(event), bool)
     for factor, similar in _SCALES:
         wide = replace(space, reach=factor * space.reach, share=space.larger(factor) * space.share)
-        one = grain if similar == np.inf else event
+        widest = factor == _SCALES[0][0]
+        one = grain if widest or similar == np.inf else event
         begins = np.concatenate([[0], np.flatnonzero(np.diff(one)) + 1])
         cluster, alike = _clusters(one, rows, wide.reach, similar)
+        # Dust that often meets by chance makes clusters, and no single event shows its density.
+        if widest and len(begins) * wide.share * alike > _MOST_MEETING:
+            continue
         form |= _no_chance(cluster[begins], rows[:, begins], wide, points, alike)[cluster]
     # A point of the smooth form between far points shows that they are several grains.
     parted = (np.diff(event) != 0) | (np.diff(rows[0]) > 1)

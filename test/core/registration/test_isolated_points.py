@@ -154,6 +154,24 @@ def test_a_pit_of_the_size_of_the_track_distance_stays_where_there_is_no_dust():
     assert not len(found.dust)
 
 
+def test_a_scratch_at_a_small_angle_to_the_lines_stays():
+    """Three lines cross it 1.6 mm apart, each for less than the lines are apart."""
+
+    def thin(x, y):
+        along, across = x * np.cos(0.125) + y * np.sin(0.125), y * np.cos(0.125) - x * np.sin(0.125)
+        end = np.clip(np.abs(along) - 2e-3, 0, None)
+        return -500e-9 * np.exp(-(across**2 + end**2) / 12e-6**2)
+
+    def lines():
+        x, y = np.meshgrid(np.linspace(-R, R, 600), np.linspace(-R, R, 126))
+        x[1::2] = x[1::2, ::-1]
+        return x.ravel(), y.ravel()
+
+    found, _, height = registered(lines, thin, 0.0)
+    assert height.min() < -300e-9
+    assert not len(found.dust)
+
+
 def test_two_grains_of_one_size_are_no_scratch():
     """They lie three tracks apart among thirty others of all sizes."""
     grains = np.arange(100, 11_900, 400)
