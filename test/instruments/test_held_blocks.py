@@ -85,7 +85,7 @@ def test_a_flipped_bit_in_the_header_of_a_block_makes_no_wrong_sample() -> None:
 @pytest.mark.parametrize("missed", [0, 1])
 @pytest.mark.parametrize("seed", [0, 2, 4])
 def test_a_start_with_blocks_of_a_hundred_triggers_is_confirmed(seed: int, missed: int) -> None:
-    """Of ten arrivals in a second, three in a row are often late, but not by a whole period."""
+    """Three of ten arrivals in a second are often late in a row, but not by a whole period."""
     random, detector, period = np.random.default_rng(seed), MissedTriggerDetector(1e-3), 1e-3
     confirmed = []
     for block in range(1, 100):
