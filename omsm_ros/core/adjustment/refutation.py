@@ -238,9 +238,8 @@ def _released(
         evidences = [evidence_of(solution, f) for f in network.families]
         still = [e.family.name for e in _beyond(evidences, released, least)] + released
         # Parsimony chooses the culprit; whatever explains as much may be it.
-        enough = best.chi_square - max(_ALIKE, _RIVAL_SHARE * best.chi_square)
-        alike = [e for e in others if _plausible(e) and e.family.name not in still
-                 and (_as_good(e, best) or e.chi_square >= enough)]  # fmt: skip
+        alike = [e for e in others
+                 if _plausible(e) and e.family.name not in still and _as_good(e, best)]  # fmt: skip
         minor = best.effect < 2 * solution.scales.texture and best.gain < SURE
         rivals = [e for e in others if not minor and explained(e, best) > _RIVAL_SHARE]
         # As a centre that is off along X and along Y: two causes that together explain as much.
@@ -328,7 +327,10 @@ def _plausible(one: Evidence) -> bool:
 
 
 def _as_good(one: Evidence, best: Evidence) -> bool:
-    return one.gain >= best.gain - max(_ALIKE, _ALIKE_SHARE * best.gain)
+    """Return whether ``one`` is as probable as ``best``, or fits as well with more parameters."""
+    likely = best.gain - max(_ALIKE, _ALIKE_SHARE * best.gain)
+    fits = best.chi_square - max(_ALIKE, _RIVAL_SHARE * best.chi_square)
+    return one.gain >= likely or one.chi_square >= fits
 
 
 def _culprit(beyond: list[Evidence], avoided: Sequence[str]) -> Evidence:
