@@ -252,11 +252,11 @@ class Gaps(NamedTuple):
         chance = 2 * np.sqrt(np.sum((weights * part.error[self.near]) ** 2, axis=1))
         for sign, unseen in zip((-1, 1), part.unseen, strict=True):
             values = sign * form
-            more = np.maximum(sign * further, 0.0)  # Form that flattens ends where it is.
-            at_rim = float(np.max(sign * rim + more - chance, initial=-np.inf))
+            # Form that flattens ends where it is.
+            at_rim = sign * rim + np.maximum(sign * further, 0.0) - chance
             summit = self._summit(values + unseen, sign * part.above + unseen, part.error)
-            found.append(max(summit, at_rim) - float(values.max()))
-            alone.append(self._alone(values))
+            found.append(float(np.max(at_rim, initial=summit) - values.max()))
+            alone.append(self._alone(values, sign * part.above))
         return np.maximum(found, 0.0), np.array(alone)
 
     def _summit(self, values: FloatArray, above: FloatArray, noise: FloatArray) -> float:
@@ -273,20 +273,21 @@ class Gaps(NamedTuple):
             may[near] = -np.inf
         return highest
 
-    def _alone(self, values: FloatArray) -> float:
-        """Return how far single points of ``values`` (n,) [m] exceed all that neighbours show."""
-        left = values.copy()
+    def _alone(self, values: FloatArray, above: FloatArray) -> float:
+        """Return how far single points of ``values`` exceed all that neighbours show, (n,) [m]."""
+        # Of what is ``above`` the smooth form (n,) [m]: a slope up to the rim makes none single.
+        left, most = values.copy(), 0.0
         for _ in range(_SINGLE):
             peak = int(np.argmax(left))
             near, at = self._about(peak)
-            away = np.abs(at)
-            shown = values[near[(away > 0) & (away < _NEXT[1])]]
-            dense = np.any((away > 0) & (away < _HALF_WAY))
-            base = float(np.median(shown if dense else values[near]))
-            if not np.max(shown, initial=-np.inf) - base < _COMPANY * (values[peak] - base):
+            others = (away := np.abs(at)) > 0
+            shown, dense = above[near[others & (away < _NEXT[1])]], np.any(away[others] < _HALF_WAY)
+            base = float(np.median(shown if dense else above[near]))
+            own = float(above[peak]) - base
+            if not np.max(shown, initial=-np.inf) - base < _COMPANY * own:
                 break
-            left[peak] = -np.inf
-        return float(values.max() - left.max())
+            left[peak], most = -np.inf, max(most, own)
+        return min(float(values.max() - left.max()), most)
 
     def _about(self, peak: int) -> tuple[IntArray, NDArray[np.complex128]]:
         """Return the points (k,) about a ``peak``, and their places in distances of the tracks."""
@@ -364,8 +365,7 @@ def _local_features(
     firsts = np.cumsum([0, *(int(cell.max()) + 1 for cell in cells[:-1])])
     own = np.stack(cells)[best, np.arange(len(some))] + firsts[best]
     mean, error = _cell_means(own, rest[some], map_.noise)
-    form = smooth[some] + mean[own]
-    return some, form, own, error[own]
+    return some, smooth[some] + mean[own], own, error[own]
 
 
 def _cells(map_: DeviationMap, shift: float = 0.0) -> list[IntArray]:

@@ -122,6 +122,20 @@ def test_an_edge_that_flattens_towards_the_rim_is_continued_to_it():
         assert abs(whole.value - true) < 2 * whole.uncertainty < 12e-9
 
 
+@pytest.mark.parametrize("angle", [0.4, 2.0, 3.6])
+def test_points_far_apart_along_steep_tracks_are_no_dust(angle):
+    """Coma is steepest at the rim, where the points of a turn are two tracks apart."""
+    way, turns = np.linspace(1, 0, 30_000), 100
+    x, y = (1.01 * R * way * f(2 * np.pi * turns * (1 - way)) for f in (np.cos, np.sin))
+    within = np.hypot(x, y) <= R
+    x, y, outline = x[within], y[within], Aperture(R)
+    form = 20e-9 * (3 * (x**2 + y**2) / R**2 - 2) * (x * np.cos(angle) + y * np.sin(angle)) / R
+    map_ = DeviationMap(x=x, y=y, deviation=form, area=area_weights(x, y, outline=outline),
+                        effects=np.empty((0, len(x))), noise=1e-12)  # fmt: skip
+    whole = extents_of_parts([map_], outline, gaps_of(map_, outline, R / turns))[0][0]
+    assert np.ptp(form) - 1e-12 < whole.value < 40e-9 + 2 * whole.uncertainty
+
+
 @pytest.mark.parametrize("missing", [0.0, 0.25])
 def test_the_rms_is_of_the_covered_part_of_the_rim(missing):
     """Astigmatism of 100 nm at the rim has a mean square of (100 nm)² / 6 on any such sector.
