@@ -29,8 +29,8 @@ _LONG = 3
 # Events of one defect differ in size by less than this factor, unless there is little dust that may
 # meet by chance; reaches between them, with the factor for events that are farther apart.
 _SIMILAR = 2.0
-_SCALES = ((6.0, 1.2), (3.0, 1.2), (1.0, np.inf), (1.0, _SIMILAR))
-# Most similar events that one has about it by chance, where those farthest apart are compared.
+_SCALES = ((1.0, _SIMILAR), (1.0, np.inf), (3.0, 1.2), (6.0, 1.2))
+# Most similar events that one has about it by chance, where those farther apart are compared.
 _MOST_MEETING = 0.25
 # A point of a defect is dust beyond this multiple of the usual size of this number of neighbours.
 _DENSE, _AROUND = 1.5, 16
@@ -288,12 +288,13 @@ def _confirmed(
     form = np.zeros(len(event), bool)
     for factor, similar in _SCALES:
         wide = replace(space, reach=factor * space.reach, share=space.larger(factor) * space.share)
-        widest = factor == _SCALES[0][0]
+        widest = factor == _SCALES[-1][0]
         one = grain if widest or similar == np.inf else event
         begins = np.concatenate([[0], np.flatnonzero(np.diff(one)) + 1])
         cluster, alike = _clusters(one, rows, wide.reach, similar)
         # Dust that often meets by chance makes clusters, and no single event shows its density.
-        if widest and len(begins) * wide.share * alike > _MOST_MEETING:
+        open_ = np.count_nonzero(~form[begins])
+        if factor > 1 and open_ * wide.share * alike > _MOST_MEETING:
             continue
         form |= _no_chance(cluster[begins], rows[:, begins], wide, points, alike)[cluster]
     # A point of the smooth form between far points shows that they are several grains.

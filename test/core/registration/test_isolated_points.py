@@ -172,6 +172,19 @@ def test_a_scratch_at_a_small_angle_to_the_lines_stays():
     assert not len(found.dust)
 
 
+def test_much_dust_of_one_size_is_no_form():
+    """One point in a hundred: each grain has others within three distances of the lines."""
+    rng = np.random.default_rng(3)
+    x, y = np.meshgrid(np.linspace(-R, R, 300), np.linspace(-R, R, 100))
+    x[1::2] = x[1::2, ::-1]
+    x, y = (v[np.hypot(x, y) <= R] for v in (x, y))
+    dusty = rng.random(len(x)) < 0.01
+    height = 50e-9 * (x**2 - y**2) / R**2 + rng.normal(0, 2e-9, len(x)) + 1e-6 * dusty
+    batch = PointBatch(x, y, height, np.empty((0, len(x))))
+    found = register(Flat(), lambda: [batch], ("piston", "tip", "tilt"))
+    assert np.array_equal(found.dust, np.flatnonzero(dusty))
+
+
 def test_two_grains_of_one_size_are_no_scratch():
     """They lie three tracks apart among thirty others of all sizes."""
     grains = np.arange(100, 11_900, 400)
