@@ -140,8 +140,10 @@ def adjusted(world: World, plan: Sequence[tuple[float, str, float]]) -> Adjustme
 
 
 def _true_form(world: World, radius: float) -> tuple[np.ndarray, ...]:
-    """Return x, y [m], share of the area, and the part's deviation along Z within ``radius`` [m],
-    the pose ``REMOVED`` taken away [m]; the rim has no area."""
+    """Return x, y [m], share of the area, and deviation along Z without the pose ``REMOVED`` [m].
+
+    radius: of the places [m]; those on the rim have no area
+    """
     nodes, weights = np.polynomial.legendre.leggauss(160)
     root, angle = np.sqrt((nodes + 1) / 2), 2 * np.pi * np.arange(360) / 360
     r = radius * np.append(root, 1.0)[:, np.newaxis]

@@ -275,7 +275,7 @@ class Gaps(NamedTuple):
 
     def _alone(self, values: FloatArray, above: FloatArray) -> float:
         """Return how far single points of ``values`` exceed all that neighbours show, (n,) [m]."""
-        # Of what is ``above`` the smooth form (n,) [m]: a slope up to the rim makes none single.
+        # Heights ``above`` the smooth form (n,) [m] decide: a slope makes no point single.
         left, most = values.copy(), 0.0
         for _ in range(_SINGLE):
             peak = int(np.argmax(left))
