@@ -176,10 +176,11 @@ def _keep_within(h5py: Any, name: str, item: Any, what: str) -> None:
 
 
 def import_optional(name: str, what: str) -> ModuleType:
-    """Return the module ``name``; raise FileError, which calls the file ``what``, without it."""
+    """Return the module ``name``; raise FileError about the file ``what`` if a module lacks."""
     try:
         return importlib.import_module(name)
     except ImportError as err:
+        missing = (err.name or name).partition(".")[0]
         raise FileError(
-            f"{what} needs a further Python package: pip install {name}, or convert it to text"
+            f"{what} needs a further Python package: pip install {missing}, or convert it to text"
         ) from err

@@ -261,7 +261,6 @@ _UPWARDS = ("SDFReader", "XYZReader", "NCReader")
 # No microscope has such pixels; its release 1.27 takes the nanometres of NanoFocus for millimetres.
 _LARGEST_PIXEL_M = 1e-3
 
-
 _SUR_PACKED, _SUR_PLAIN, _SUR_HEADER_BYTES = b"DSCOMPRESSED", b"DIGITAL SURF", 512
 
 
