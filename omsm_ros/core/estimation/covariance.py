@@ -1,7 +1,7 @@
 """Covariance of fitted parameters in coloured noise."""
 
 import numpy as np
-from scipy import fft, linalg, ndimage
+from scipy import fft, linalg, ndimage, signal
 
 from omsm_ros.core.estimation.model_structure import Fit
 from omsm_ros.core.estimation.noise import RandomWalk, scatter_in_time, uneven_rows, with_walk
@@ -25,7 +25,7 @@ def autoregression(
 
     By Yule and Walker, order 0 to 12 chosen by BIC; order 0 is white.
 
-    leverage: see :func:`noise_spectrum`
+    leverage: share of white noise at each frequency that the fit took, up to half the sampling rate
     """
     n = len(residual)
     highest = min(_MAX_NOISE_ORDER, n - 1)
@@ -51,33 +51,37 @@ def autoregression(
     return np.asarray(best[1]), best[2]
 
 
-def noise_spectrum(
-    residual: FloatArray, length: int, leverage: FloatArray | None = None
-) -> FloatArray:
-    """Return the autoregressive variance spectrum (``length`` // 2 + 1,) of a residual (n,).
-
-    leverage: share of the noise at each frequency that the fit took from the residual, see
-        :func:`leverage_of`; None where the fit has far fewer parameters than samples
-    """
-    coefficients, variance = autoregression(residual, leverage)
+def noise_spectrum(residual: FloatArray, length: int) -> FloatArray:
+    """Return the autoregressive variance spectrum (``length`` // 2 + 1,) of a residual (n,)."""
+    coefficients, variance = autoregression(residual)
     return np.asarray(variance / np.abs(fft.rfft(coefficients, length)) ** 2)
 
 
-def leverage_of(basis: FloatArray, length: int) -> FloatArray:
-    """Return the share of white noise at each frequency that a fit takes, (``length`` // 2 + 1,).
+def noise_before_fit(
+    residual: FloatArray, followed: FloatArray, used: BoolArray, length: int
+) -> FloatArray:
+    """Return the variance spectrum (``length`` // 2 + 1,) of the noise that left a residual (k,).
 
-    basis: (r, n), orthonormal rows that span the columns of the fit
+    followed: (r, k), orthonormal rows that span the columns of the fit; overwritten
+    used: (n,), which samples of the record these are;  length: even
 
     A fit has its parameters where the inputs have power, which is often where coloured noise is
     strong. Its residual has less noise there than elsewhere: one factor for all frequencies, by the
     degrees of freedom, would understate it (as the leverage of MacKinnon and White 1985 does in
-    time).
+    time). Noise slower than the autoregression is a random walk in what this makes white.
     """
-    taken = sum(np.abs(fft.rfft(row, length)) ** 2 for row in basis) / basis.shape[1]
+    taken = sum(np.abs(fft.rfft(row, length)) ** 2 for row in followed) / len(residual)
     # As smooth as an autoregression of the highest order: at a single line that the fit follows,
     # what is left need not be noise.
-    smooth = ndimage.uniform_filter1d(taken, length // (2 * _MAX_NOISE_ORDER), mode="mirror")
-    return np.asarray(smooth, np.float64)
+    leverage = ndimage.uniform_filter1d(taken, length // (2 * _MAX_NOISE_ORDER), mode="mirror")
+    whitening, variance = autoregression(residual, leverage)
+    for row in followed:
+        row[:] = signal.lfilter(whitening, [1.0], row)
+    on_grid = np.zeros(len(used))
+    on_grid[used] = signal.lfilter(whitening, [1.0], residual)
+    walk, _ = RandomWalk.of(used, followed.T, [slice(0, len(used))]).variance(on_grid)
+    even = with_walk(np.full(length // 2 + 1, variance), walk, length)
+    return np.asarray(even / np.abs(fft.rfft(whitening, length)) ** 2)
 
 
 def weighted_gram(rows: FloatArray, length: int, noise: FloatArray) -> FloatArray:
@@ -121,9 +125,9 @@ def parameter_covariance(
     score_covariance = uneven.T @ uneven
     walk = 0.0
     if walks:
-        likelihood = RandomWalk.of(problem, basis_and_inverse(columns, _RANK_TOLERANCE)[0])
-        left = problem.on_grid(residual, 0.0)
-        walk = likelihood.variance(left, on_grid[:0])[0] if likelihood.shows(left) else 0.0
+        basis = basis_and_inverse(columns, _RANK_TOLERANCE)[0]
+        likelihood = RandomWalk.of(problem.used, basis, problem.recordings)
+        walk = likelihood.variance(problem.on_grid(residual, 0.0))[0]
     missed = problem.on_grid(residual, np.nan)
     for part in problem.recordings:
         # Each recording has noise of its own.

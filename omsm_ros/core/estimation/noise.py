@@ -402,13 +402,13 @@ class RandomWalk:
     ratios: FloatArray
 
     @classmethod
-    def of(cls, problem: Problem, basis: FloatArray) -> RandomWalk:
-        """Return the likelihood for the samples that ``problem`` compares.
+    def of(cls, used: BoolArray, basis: FloatArray, recordings: Sequence[slice]) -> RandomWalk:
+        """Return the likelihood for the samples of ``recordings`` that are ``used`` (n,).
 
-        basis: (k, r) orthonormal columns at those samples
+        basis: (k, r) columns at those samples
         """
-        used, size = problem.used, max(len(problem.used) // _WALK_BLOCKS, 1)
-        starts = np.concatenate([np.arange(p.start, p.stop, size) for p in problem.recordings])
+        size = max(len(used) // _WALK_BLOCKS, 1)
+        starts = np.concatenate([np.arange(p.start, p.stop, size) for p in recordings])
         place = np.searchsorted(starts, np.flatnonzero(used), side="right") - 1
         counts = np.bincount(place, minlength=len(starts)).astype(np.float64)
         kept = np.flatnonzero(counts)
@@ -418,37 +418,35 @@ class RandomWalk:
         followed = np.add.reduceat(basis, first, axis=0) / np.sqrt(counts)[:, np.newaxis]
         left, values, _ = np.linalg.svd(followed, full_matrices=True)
         free = left[:, np.sum(values > _FOLLOWED) :]
-        recording = np.searchsorted(problem.starts, starts, side="right")
+        recording = np.searchsorted([p.start for p in recordings], starts, side="right")
         shared = np.minimum.outer(starts, starts) * np.equal.outer(recording, recording)
         walk = shared * np.sqrt(np.outer(counts, counts))
         ratios, directions = np.linalg.eigh(free.T @ walk @ free)
         return cls(starts, len(used), counts, free @ directions, np.maximum(ratios, 0.0))
 
-    def shows(self, residual: FloatArray) -> bool:
-        """Return whether ``residual`` (n,), 0 where not compared, walks (Schwarz 1978)."""
-        if not len(self.ratios):  # the fit follows all block means
-            return False
-        likelihood, *_ = self._likelihood(residual, np.empty((0, len(residual))))
-        return bool(2 * np.max(likelihood - likelihood[0]) > np.log(len(self.ratios)))
-
-    def variance(self, residual: FloatArray, rows: FloatArray) -> tuple[float, float]:
+    def variance(
+        self, residual: FloatArray, rows: FloatArray | tuple[()] = ()
+    ) -> tuple[float, float]:
         """Return the variance per sample of the walk's increments, and χ² of ``rows`` (c, n).
 
         residual: (n,), 0 where not compared
 
         The walk is estimated together with ``rows`` only where they describe clearly more than a
-        walk alone, because they were chosen for what they take of it. The variance is zero if no
-        walk is left then. χ² is the likelihood ratio of a walk with ``rows`` to one without.
+        walk alone, because they were chosen for what they take of it. The variance is zero where
+        no walk is shown (Schwarz 1978). χ² is the likelihood ratio of a walk with ``rows`` to one
+        without.
         """
-        restricted, white, alone = self._likelihood(residual, rows[:0])
-        explained = 0.0
+        if not len(self.ratios):  # the fit follows all block means
+            return 0.0, 0.0
+        restricted, white, alone = self._likelihood(residual, ())
+        explained, price = 0.0, np.log(len(self.ratios))
         if len(rows):
             with_rows, white_then, together = self._likelihood(residual, rows)
-            explained, price = 2 * float(np.max(together) - np.max(alone)), np.log(len(self.ratios))
+            explained = 2 * float(np.max(together) - np.max(alone))
             if 0.5 * (explained - len(rows) * price) > VERY_STRONG:
                 restricted, white = with_rows, white_then
-                if 2 * np.max(with_rows - with_rows[0]) < price:
-                    return 0.0, explained
+        if 2 * np.max(restricted - restricted[0]) < price:
+            return 0.0, explained
         best = int(np.argmax(restricted))
         return float(self._tried[best] * white[best]), explained
 
@@ -458,10 +456,10 @@ class RandomWalk:
         return np.append(0.0, _WALK_RATIOS / max(float(self.ratios[-1]), _TINY))
 
     def _likelihood(
-        self, residual: FloatArray, rows: FloatArray
+        self, residual: FloatArray, rows: FloatArray | tuple[()]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return, by ratio: log restricted likelihood, white variance, log likelihood."""
-        sums = np.add.reduceat(np.vstack([rows, residual]), self.starts, axis=1)
+        sums = np.add.reduceat(np.vstack([*rows, residual]), self.starts, axis=1)
         shares = (sums / np.sqrt(self.counts)) @ self.contrasts
         variances = 1 + np.outer(self._tried, self.ratios)
         gram = np.einsum("id,td,jd->tij", shares, 1 / variances, shares)

@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 from scipy import fft, linalg, ndimage, signal
 
-from omsm_ros.core.estimation.covariance import leverage_of, noise_spectrum, weighted_gram
+from omsm_ros.core.estimation.covariance import noise_before_fit, weighted_gram
 from omsm_ros.core.estimation.impulse_response import AVERAGED_LINES, coherent_power
 from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.optimisation import Projection, descend
@@ -149,6 +149,15 @@ class SectionsFit:
     def sections(self) -> FloatArray:
         """Return d1, d2 of each section (k, 2), scaled."""
         return sections_of(self.nonlinear, self.order)
+
+    def on_grids(self) -> list[FloatArray]:
+        """Return the residual of each record (n,), 0 where it is not compared."""
+        grids, start = [], 0
+        for one in self.problem.spectra:
+            grids.append(np.zeros(len(one.record)))
+            grids[-1][one.places] = self.residual[start : start + len(one.places)]
+            start += len(one.places)
+        return grids
 
     def roots(self) -> ComplexArray:
         """Return the poles in w, scaled, (n,)."""
@@ -290,10 +299,9 @@ class SectionsProblem:
         """Return the covariance (p, p) of the parameters of ``fitted.model(period)``.
 
         It is the sandwich of the least squares in coloured noise, with the autocovariance of the
-        residual of each record.
+        residual of each record, and a random walk where that shows one.
         """
-        order, start = fitted.order, 0
-        parts = [_Columns(self, one, fitted.nonlinear, order) for one in self.spectra]
+        parts = [_Columns(self, one, fitted.nonlinear, fitted.order) for one in self.spectra]
         columns = [
             part.without_free(np.concatenate([part.rows, part.slopes(fitted.linear)]))
             for part in parts
@@ -301,20 +309,18 @@ class SectionsProblem:
         gram = np.sum([each @ each.T for each in columns], axis=0)
         # A direction lost in rounding is as uncertain as the weakest.
         root, score = inverse_root(gram, keep=True), np.zeros_like(gram)
-        for part in parts:
+        for part, missed in zip(parts, fitted.on_grids(), strict=True):
             one, basis = part.one, root.T @ columns.pop(0)
-            residual = fitted.residual[start : start + len(one.places)]
-            start += len(one.places)
-            length = fft.next_fast_len(len(one.record) + 64, real=True)
-            length += length % 2
+            length = 2 * fft.next_fast_len(len(missed) // 2 + 32, real=True)
             # An orthonormal basis of the responses to initial states and the offset.
             after = len(one.places) - part.free.shape[1]
             free = np.pad(part.free, ((0, 1), (0, after))) - np.append(part.mean, -1)[:, None]
             free = linalg.block_diag(part.root, len(one.places) ** -0.5).T @ free
-            leverage = leverage_of(np.concatenate([basis, free]), length)
-            on_grid = np.zeros((len(basis), len(one.record)))
-            on_grid[:, one.places] = basis
-            score += weighted_gram(on_grid, length, noise_spectrum(residual, length, leverage))
+            followed, used = np.concatenate([basis, free]), one.record.used
+            noise = noise_before_fit(missed[used], followed, used, length)
+            on_grid = np.zeros((len(basis), len(missed)))
+            on_grid[:, used] = basis
+            score += weighted_gram(on_grid, length, noise)
         turn = self._coefficient_jacobian(fitted, RATE / period) @ root
         found = turn @ score @ turn.T
         return np.asarray(0.5 * (found + found.T))
@@ -464,10 +470,8 @@ def _missing_pairs(problem: SectionsProblem, fitted: SectionsFit, count: int) ->
     a disturbance or distortion may be stronger there than a mode that is missing.
     """
     index = int(np.argmax([len(one.places) for one in problem.spectra]))
-    start = sum(len(one.places) for one in problem.spectra[:index])
-    one, grid = problem.spectra[index], np.zeros(len(problem.records[index]))
-    grid[one.places] = fitted.residual[start : start + len(one.places)]
-    spectrum = np.asarray(fft.rfft(grid, one.length), np.complex128)
+    one = problem.spectra[index]
+    spectrum = np.asarray(fft.rfft(fitted.on_grids()[index], one.length), np.complex128)
     power, shown = ndimage.uniform_filter1d(np.abs(spectrum) ** 2, 15), one.excited[0][[0, -1]]
     power[(one.angle < shown[0]) | (one.angle > shown[1])] = 0.0
     drives = _Columns(problem, one, fitted.nonlinear, fitted.order).drives[:, np.newaxis]

@@ -123,15 +123,13 @@ def _missed(chosen: SampledCandidate, cycles: FloatArray) -> tuple[ComplexArray,
     An impulse response from the inputs to the residual of the first record resolves modes that are
     narrower than a block of lines. The second value is the rms of its output over the model's.
     """
-    fitted, one = chosen.fit, chosen.fit.problem.spectra[0]
-    residual, grid = fitted.residual[: len(one.places)], np.zeros(len(one.record))
-    grid[one.places] = residual
+    one, grid = chosen.fit.problem.spectra[0], chosen.fit.on_grids()[0]
     inputs = one.record.inputs - np.mean(one.record.inputs, axis=0)
     taps = impulse_response(inputs, grid, one.record.used)
     if taps is None:
         return np.zeros((inputs.shape[1], len(cycles)), np.complex128), 0.0
     answer = np.sum(signal.fftconvolve(inputs.T, taps, axes=1), axis=0)[one.places]
-    modelled = max(float(np.std(one.output - residual)), np.finfo(float).tiny)
+    modelled = max(float(np.std(one.output - grid[one.places])), np.finfo(float).tiny)
     turned = np.exp(-2j * np.pi * np.outer(np.arange(taps.shape[1]), cycles))
     return np.asarray(taps @ turned, np.complex128), float(np.std(answer)) / modelled
 
@@ -194,13 +192,9 @@ class _Block:
 
 def _blocks(candidate: SampledCandidate, period: float) -> list[_Block]:
     """Return the differences of the responses of all records from the model, without a model."""
-    fitted = candidate.fit
-    model, start, found = fitted.model(), 0, []
-    for one in fitted.problem.spectra:
+    model, found = candidate.fit.model(), []
+    for one, grid in zip(candidate.fit.problem.spectra, candidate.fit.on_grids(), strict=True):
         record = one.record
-        grid = np.zeros(len(record))
-        grid[one.places] = fitted.residual[start : start + len(one.places)]
-        start += len(one.places)
         centred = record.inputs - np.mean(record.inputs, axis=0)
         spectra = np.asarray(np.fft.rfft(centred, axis=0).T, np.complex128)
         frequency = np.asarray(np.fft.rfftfreq(len(record)), np.float64)

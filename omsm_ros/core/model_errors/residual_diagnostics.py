@@ -181,8 +181,8 @@ class ResidualSpace:
     @cached_property
     def _walk(self) -> RandomWalk | None:
         """A random walk in the residual, None where it shows none."""
-        walk = RandomWalk.of(self.problem, self._basis)
-        return walk if walk.shows(self._residual) else None
+        walk = RandomWalk.of(self.problem.used, self._basis, self.problem.recordings)
+        return walk if walk.variance(self._residual)[0] > 0 else None
 
     @cached_property
     def _scatter(self) -> float:

@@ -145,7 +145,8 @@ def test_the_rate_of_a_random_walk_is_estimated_beside_what_the_fit_follows():
     """Mean of 20 walks, against the rate with which they were drawn."""
     model = search_model_errors(prepare(late_record(0.0), "encoder"), model_from_start)
     space = model.diagnostics.space
-    walks = RandomWalk.of(space.problem, np.linalg.qr(space.problem.sensitivity(space.fitted))[0])
+    basis = np.linalg.qr(space.problem.sensitivity(space.fitted))[0]
+    walks = RandomWalk.of(space.problem.used, basis, space.problem.recordings)
     rows, used = np.empty((0, len(TIME))), space.problem.used
     found = []
     for seed in range(20):
@@ -157,4 +158,4 @@ def test_the_rate_of_a_random_walk_is_estimated_beside_what_the_fit_follows():
         assert walks.variance(residual, line)[0] == found[-1]
         assert walks.variance(residual + 100e-9 * line[0], line)[0] < 1.5 * found[-1]
     assert np.mean(found) / (6e-9**2 * PERIOD) == pytest.approx(1, abs=0.2)
-    assert not walks.shows(np.where(space.problem.used, noise, 0.0))
+    assert walks.variance(np.where(used, noise, 0.0))[0] == 0
