@@ -200,7 +200,8 @@ class MissedTriggerDetector:
         due += self._ahead
         excess = self._reference.excess(due, arrival)
         jumped = self._reference.proven and (self.resets or excess < 0)
-        if abs(excess) <= self._pause / 2:
+        # The stamps of both devices show if more triggers were missed at a reset.
+        if abs(excess) <= (_STEP_S if self.resets else self._pause / 2):
             self._after_pause = None
         elif after_silence or (jumped and not self._after_pause):
             self._paused = self._paused if self._after_pause else self._newest
@@ -262,8 +263,9 @@ class MissedTriggerDetector:
         return found
 
 
-# Square of the mean resultant length of phases above which arrivals keep step with the trigger.
-_LOCKED = 0.1
+# Square of the mean resultant length of phases above which arrivals keep step with the trigger, or
+# that multiple of what random phases have, which chance does not reach.
+_LOCKED, _BY_CHANCE = 0.1, 12.0
 # Arrivals on a grid of parts of a period are in step with the trigger, too. With parts below
 # 1 - _LATE_PERIODS, a sample after a missed trigger still arrives too late to be confirmed.
 _HARMONICS = np.arange(1, round(1 / (1 - _LATE_PERIODS)) + 1)
@@ -282,7 +284,7 @@ class _Phases:
     def __init__(self, period: float) -> None:
         self._period = period
         self._begin, self._lates = -math.inf, list[float]()  # of the current span
-        self._means: deque[tuple[complex, ...]] = deque(maxlen=_LATEST)  # time [s], harmonics
+        self._means: deque[tuple[complex, ...]] = deque(maxlen=_LATEST)  # [s], 1/n, harmonics
         self.locked = False
 
     def add(self, late: float, arrival: float) -> None:
@@ -295,14 +297,16 @@ class _Phases:
 
     def _end_span(self, late: FloatArray) -> None:
         early = late[late < late.min() + _EARLY_PERIODS]  # a delay says nothing of the age
-        self._means.append((self._begin, *np.exp(2j * np.pi * np.outer(_HARMONICS, early)).mean(1)))
-        begin, *means = np.array(self._means).T
+        mean = np.exp(2j * np.pi * np.outer(_HARMONICS, early)).mean(1)
+        self._means.append((self._begin, 1 / len(early), *mean))
+        begin, random, *means = np.array(self._means).T
         since = (begin - begin[0]).real / self._period
         most = 5 * DRIFT_SIGMA  # crystals differ by less
         drifts = np.linspace(-most, most, 8 * math.ceil(2 * most * since[-1]) + 1)
         turn = np.exp(-2j * np.pi * np.outer(drifts, since))
         common = [turn**harmonic @ mean for harmonic, mean in zip(_HARMONICS, means, strict=True)]
-        self.locked = len(since) > 1 and (np.max(np.abs(common)) / len(since)) ** 2 > _LOCKED
+        limit = min(_LOCKED, _BY_CHANCE * random.mean().real / len(since))
+        self.locked = len(since) > 1 and (np.max(np.abs(common)) / len(since)) ** 2 > limit
 
 
 class _Reference:
@@ -357,8 +361,7 @@ class _Reference:
                 self._earliest[-1:] = [(before, least), (arrival, late)]
             return False
         self.confirmed, self._mark = arrival, motion.count - (1 if in_time else 2)
-        if in_time:
-            self.in_time = arrival
+        self.in_time = arrival if in_time else self.in_time
         if self.proven:
             self._line = (self._line[0] + min(excess, 0.0), self._line[1])
         return True
@@ -466,7 +469,8 @@ class _Reference:
         off = np.flatnonzero(sliding_window_view(rest, _SHOWING).min(axis=1) > _AGE_PERIODS)
         aged = (shifted(first, 1, first + _SHOWING)[0] - none > -_EXCLUDED for first in off)
         sure = most < _POSSIBLE and not (locked and any(aged)) and seen[-_OPEN:].any()
-        return 0 if sure and np.count_nonzero(~seen[:-_OPEN]) <= _UNSEEN * len(late) else None
+        unseen = np.diff(begin)[steps.start - 1 :][:-_OPEN] @ ~seen[:-_OPEN]
+        return 0 if sure and unseen <= _UNSEEN * (begin[-1] - begin[0]) else None
 
     def _set_line(self, known: int) -> None:
         """Lay the highest line below the earliest arrivals of the first spans."""

@@ -67,9 +67,7 @@ class Channels(NamedTuple):
 
 def wrapping(axes: tuple[AxisScaling, ...] | None, counts: int) -> tuple[AxisScaling, ...] | None:
     """Return the axes, whose encoders wrap after ``counts`` if they state nothing else."""
-    if axes is None:
-        return None
-    return tuple(replace(axis, wrap=axis.wrap or counts) for axis in axes)
+    return axes and tuple(replace(axis, wrap=axis.wrap or counts) for axis in axes)
 
 
 # Encoders nearer to zero than this may have been at zero all along [counts]. Those that were away
@@ -131,9 +129,8 @@ class BlockCutter:
         A trigger of a device without time may be played faster than it was recorded: see
         ``arrives_otherwise``.
         """
-        if not self._channels.timed:
-            return self._free and self.arrives_otherwise
-        return self._evenly_wrong
+        timed = self._channels.timed
+        return self._evenly_wrong if timed else self._free and self.arrives_otherwise
 
     @property
     def rate_known(self) -> bool:

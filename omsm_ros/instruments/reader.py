@@ -94,8 +94,7 @@ class DeviceReader:
             began = time.monotonic()
             if self._read_once(stop):
                 pause = least
-            if stop.wait(max(began + pause - time.monotonic(), least)):
-                break
+            stop.wait(max(began + pause - time.monotonic(), least))
             pause = min(2 * pause, self._back_off[1])
         self.state = State.ENDED
 

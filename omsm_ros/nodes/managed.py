@@ -370,10 +370,8 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         )
 
     def _report(self) -> StateReport:
-        if self.stage is LifecycleStage.UNCONFIGURED:
-            report = StateReport("")
-        else:
-            report = self.report()
+        configured = self.stage is not LifecycleStage.UNCONFIGURED
+        report = self.report() if configured else StateReport("")
         if self.stage is not LifecycleStage.ACTIVE:
             report.add(WARN, f"{self.stage.value}: it does nothing until it is activated")
         if self._failure is not None:

@@ -58,6 +58,21 @@ def test_a_trigger_is_below_the_rate_of_what_is_averaged(bench: Any) -> None:
     assert float(run.instrument._values["SHZ"]) == pytest.approx(4200, rel=1e-4)
 
 
+@pytest.mark.parametrize(("emulator", "device"), BOTH)
+def test_averaging_that_another_client_sets_meanwhile_leads_to_a_new_setup(
+    emulator: Any, device: Any, bench: Any
+) -> None:
+    run = bench(emulator, device, SIX)
+    run.run(1.0)
+    run.instrument._values["AVD"] = "4"
+    run.run(3.5)
+    before = run.delivered
+    run.run(1.0)
+    assert any("another client" in trouble for trouble in run.troubles)
+    assert run.instrument.rate() == 1000
+    assert run.delivered - before > 800
+
+
 def test_another_sync_left_by_somebody_else_is_set_back(bench: Any) -> None:
     class OwnSync(ChrocodileEmulator):
         _sync = b"xy"

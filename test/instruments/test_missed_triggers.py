@@ -6,7 +6,6 @@ Both wires are written here, in plain numpy and text: a probe that sends its own
 
 from __future__ import annotations
 
-import math
 import os
 import re
 from dataclasses import dataclass
@@ -302,23 +301,6 @@ def test_another_rate_is_confirmed_once_the_arrivals_show_it(deviation: float) -
     assert all(confirmed[-200:])
 
 
-@pytest.mark.parametrize("seed", range(8))
-@pytest.mark.parametrize("missed", [0, 1])
-def test_polls_in_step_with_the_trigger_are_never_renumbered(seed: int, missed: int) -> None:
-    """The age of their last sample falls by a period now and then, as if a trigger was missed."""
-    random, detector, period = np.random.default_rng(seed), MissedTriggerDetector(PERIOD), PERIOD
-    polls = np.arange(1, 1500) * 10 * period * (1 + random.uniform(-3e-4, 3e-4))
-    at, confirmed = random.uniform(0.5, 5.0), 0.0
-    for poll in polls + random.uniform(0, period):
-        taken = math.floor(poll / period) * period
-        due = taken - missed * period * (taken > at)
-        if detector.confirms(due, UPTIME_S + poll):
-            confirmed = taken
-        assert detector.forget_missed() == 0
-    assert confirmed > 0.4
-    assert confirmed < at or not missed
-
-
 @pytest.mark.parametrize("latency", [1e-5, 2e-4])
 @pytest.mark.parametrize("at", [0.801, 1.401])
 def test_a_trigger_missed_by_single_samples_is_seen_whatever_the_drift(
@@ -420,7 +402,7 @@ def test_a_counter_reset_in_a_running_stream_costs_only_the_portion_before_it() 
     assert cutter.withheld == 5003 - begin < 10
 
 
-@pytest.mark.parametrize(("pause", "within"), [(0.0, 5), (0.1503, 100)])
+@pytest.mark.parametrize(("pause", "within"), [(0.0, 5), (0.0503, 100), (0.1503, 100)])
 def test_an_arrival_in_time_after_a_reset_confirms_at_once(pause: float, within: int) -> None:
     """If the trigger pauses at the reset, for no longer than a busy host, the line is new."""
     random, detector, reset = np.random.default_rng(7), MissedTriggerDetector(PERIOD, 0.2), 4_000
@@ -445,25 +427,6 @@ def test_a_trigger_missed_at_or_after_a_reset_is_seen(after: float, level: float
     counts, triggers, cutter = cut(reset=5003, missed_at=5.003 + after, level=level)
     np.testing.assert_array_equal(counts, triggers)
     assert cutter.unconfirmed or cutter.detector.missed == 2
-
-
-def test_arrivals_on_a_grid_of_half_a_period_do_not_hide_a_missed_trigger() -> None:
-    """A USB frame of 1 ms becomes early enough for the age of a 500 Hz trigger when one is missed.
-
-    Then arrivals are earlier by half a period and later by a period at once.
-    """
-    frame, period, drift, at = 1e-3, 2e-3, -8e-6, 4.2
-    random, detector = np.random.default_rng(3), MissedTriggerDetector(2e-3)
-    polls = np.cumsum(0.005 + abs(random.normal(1e-4, 5e-5, 1200)))
-    first = -drift * at  # the frame at that time is just as old as the trigger
-    counts = np.floor((polls - first) / (period * (1 + drift)))
-    arrivals = np.ceil(polls / frame) * frame
-    confirmed = np.array([
-        detector.confirms(float((count - (poll > at)) * period), UPTIME_S + float(arrival))
-        for count, poll, arrival in zip(counts, polls, arrivals, strict=True)
-    ])  # fmt: skip
-    assert np.any(confirmed & (polls < at))
-    assert not np.any(confirmed & (polls > at))
 
 
 def followed_to(late: Any) -> CsvStreamDevice:

@@ -159,6 +159,8 @@ class Chrocodile(StreamDevice):
                 f"{self._transport.name} averages {self._exposures} exposures and sends no fewer "
                 "samples; it is set up again for that"
             )
+        if self._cutter.wrong_rate and not blocks:
+            self._check_settings(math.inf)
         return blocks
 
     def dark_reference(self) -> str:
@@ -243,13 +245,12 @@ class Chrocodile(StreamDevice):
         the trigger again would reset the counter, and with it the pairing with another device.
         """
         with suppress(DeviceTimeoutError):
-            if not self._selected():
+            found = self._try("SODX", QUERY).numbers
+            if found and not set(self._selection) <= set(found):
                 return False
-        for name in ("SHZ", "AVD"):
-            found = self._try(name, QUERY).numbers
-            if found and name in before and f"{found[0]:g}" != before[name].split()[0]:
-                return False
-        return True
+        answers = ((name, self._try(name, QUERY).numbers) for name in ("SHZ", "AVD", "AVS"))
+        now = {name: f"{said[0]:g}" for name, said in answers if said and name in before}
+        return all(before[name].split()[0] == value for name, value in now.items())
 
     def _read(self, name: str) -> None:
         if name not in self._identity and (found := self._try(name, QUERY).numbers):
@@ -317,25 +318,25 @@ class Chrocodile(StreamDevice):
 
     def _listen_in(self, silent: float) -> None:
         """Check that a silent device still has its settings; a free-running one must send."""
-        now = self._monotonic()
-        if min(silent, now - self._asked) < self._wanted.patience:
-            return
-        self._asked = now
-        if not self._selected():
-            raise DeviceError(
-                f"{self._transport.name} lost its settings (a restart?); it is set up again"
-            )
-        if self._wanted.trigger == "free_run":
+        if self._check_settings(silent) and self._wanted.trigger == "free_run":
             self._unheard = True
             raise NoSamplesError(
                 f"{self._transport.name} answers, but sent no readable telegram for "
                 f"{silent:.1f} s; check its trigger, and that no other program changes its settings"
             )
 
-    def _selected(self) -> bool:
-        """Return whether the device still has the selection; a restart sets it back."""
-        found = self._try("SODX", QUERY).numbers
-        return not found or set(self._selection) <= set(found)
+    def _check_settings(self, waited: float) -> bool:
+        """Return whether it was time to check them; DeviceError if the device has others."""
+        now = self._monotonic()
+        if min(waited, now - self._asked) < self._wanted.patience:
+            return False
+        self._asked = now
+        if not self._is_unchanged(self._identity):
+            raise DeviceError(
+                f"{self._transport.name} lost its settings (a restart, or another client?); it is "
+                "set up again"
+            )
+        return True
 
     def _converted(self, batches: Sequence[Records]) -> Samples:
         parts = (self._convert(records) for records in batches if len(records))

@@ -1,0 +1,63 @@
+"""Arrivals in step with the trigger: the age of their last sample changes by a period now and then.
+
+That looks like a missed trigger, so they confirm samples, but give no number.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from omsm_ros.instruments.arrivals import MissedTriggerDetector
+
+PERIOD = 1e-3
+UPTIME_S = 123_456.0  # of the host, from which its monotonic clock counts
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("missed", [0, 1])
+def test_polls_in_step_with_the_trigger_are_never_renumbered(seed: int, missed: int) -> None:
+    """The age of their last sample falls by a period now and then, as if a trigger was missed."""
+    random, detector, period = np.random.default_rng(seed), MissedTriggerDetector(PERIOD), PERIOD
+    polls = np.arange(1, 1500) * 10 * period * (1 + random.uniform(-3e-4, 3e-4))
+    at, confirmed = random.uniform(0.5, 5.0), 0.0
+    for poll in polls + random.uniform(0, period):
+        taken = math.floor(poll / period) * period
+        due = taken - missed * period * (taken > at)
+        if detector.confirms(due, UPTIME_S + poll):
+            confirmed = taken
+        assert detector.forget_missed() == 0
+    assert confirmed > 0.4
+    assert confirmed < at or not missed
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nor_are_polls_in_step_whose_arrivals_scatter_by_half_a_period(seed: int) -> None:
+    random, period = np.random.default_rng(seed), 2e-4
+    detector = MissedTriggerDetector(period)
+    polls = np.arange(1, 600) * 30 * period * (1 - 1.5e-4) + random.uniform(0.9, 1.0) * period
+    late = random.exponential(period / 2, len(polls))
+    for poll, arrival in zip(polls, np.maximum.accumulate(polls + late), strict=True):
+        detector.confirms(math.floor(poll / period) * period, UPTIME_S + float(arrival))
+        assert detector.forget_missed() == 0
+
+
+def test_a_missed_trigger_is_seen_on_a_grid_of_half_a_period() -> None:
+    """A USB frame of 1 ms becomes early enough for the age of a 500 Hz trigger when one is missed.
+
+    Then arrivals are earlier by half a period and later by a period at once.
+    """
+    frame, period, drift, at = 1e-3, 2e-3, -8e-6, 4.2
+    random, detector = np.random.default_rng(3), MissedTriggerDetector(2e-3)
+    polls = np.cumsum(0.005 + abs(random.normal(1e-4, 5e-5, 1200)))
+    first = -drift * at  # the frame at that time is just as old as the trigger
+    counts = np.floor((polls - first) / (period * (1 + drift)))
+    arrivals = np.ceil(polls / frame) * frame
+    confirmed = np.array([
+        detector.confirms(float((count - (poll > at)) * period), UPTIME_S + float(arrival))
+        for count, poll, arrival in zip(counts, polls, arrivals, strict=True)
+    ])  # fmt: skip
+    assert np.any(confirmed & (polls < at))
+    assert not np.any(confirmed & (polls > at))
