@@ -6,6 +6,7 @@ removes unfinished files and ends by the signal. With ``--json`` standard output
 object and nothing else.
 """
 
+import atexit
 import gc
 import signal
 from collections.abc import Sequence
@@ -23,6 +24,8 @@ _OBJECTS_BETWEEN_COLLECTIONS = 50_000
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
+    # At its end Python would search all that was loaded for cycles, for another 6 % of the time.
+    atexit.register(gc.freeze)
     one_thread_of_blas()
     with interruptible():
         from omsm_ros.cli import command_line

@@ -55,12 +55,9 @@ def figure(width: float, height: float, rows: int = 1, **options: Any) -> tuple[
     high = (height - _BOTTOM_IN - _TOP_IN - (rows - 1) * between) / rows
     axes_width = width - _LEFT_IN - _RIGHT_IN
     places = {
-        "left": _LEFT_IN / width,
-        "right": 1 - _RIGHT_IN / width,
-        "bottom": _BOTTOM_IN / height,
-        "top": 1 - _TOP_IN / height,
-        "hspace": between / high,
-    }
+        "left": _LEFT_IN / width, "right": 1 - _RIGHT_IN / width, "hspace": between / high,
+        "bottom": _BOTTOM_IN / height, "top": 1 - _TOP_IN / height,
+    }  # fmt: skip
     axes = [*made.subplots(rows, squeeze=False, gridspec_kw=places, **options)[:, 0]]
     for one in axes:
         quiet(one)
@@ -118,13 +115,9 @@ def legend_above(axes: Axes) -> None:
 def legend(axes: Axes, **options: Any) -> None:
     """Put a legend without a frame around it."""
     look: dict[str, Any] = {
-        "fontsize": TEXT_PT,
-        "labelcolor": INK,
-        "framealpha": 0.85,
-        "edgecolor": "none",
-        "handlelength": 1.8,
-        "borderpad": 0.2,
-    }
+        "fontsize": TEXT_PT, "labelcolor": INK, "framealpha": 0.85, "edgecolor": "none",
+        "handlelength": 1.8, "borderpad": 0.2,
+    }  # fmt: skip
     axes.legend(**look, **options)
 
 

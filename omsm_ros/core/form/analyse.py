@@ -223,8 +223,8 @@ def analyse_form(
     found = register(surface, portions, asked, declared=declared, **how)  # type: ignore[arg-type]
     gathered = _Gathered(surface, found, aperture)
     for portion in portions():
-        for begin in range(0, len(portion.x), CHUNK):
-            gathered.add(PointBatch(*(v[..., begin : begin + CHUNK] for v in portion)))
+        for part in portion.chunks(CHUNK):
+            gathered.add(part)
     held = range(len(sources), found.moved.shape[1])  # Their offsets are upper bounds, too.
     x, y = places = gathered.places
     uncovered, outline = best_covered(x, y, found.spacing, aperture or found.disc, aperture is None)
@@ -243,29 +243,17 @@ def analyse_form(
     del strip  # it is as large as the map
     figures, textures = _figures(smooth, zernike, cells, bands, outline, even, gaps)
     return FormResult(
-        registration=found,
-        aperture=outline,
-        map=map_,
+        registration=found, aperture=outline, map=map_, zernike=zernike, bands=bands,
         deviation=figures | gathered.as_measured(map_) | textures,
-        zernike=zernike,
-        bands=bands,
-        profiles=profiles(map_, found.disc),
-        density=power_density(cells),
-        counts=gathered.counts,
-        dust=gathered.dust,
-        uncovered=uncovered,
-    )
+        profiles=profiles(map_, found.disc), density=power_density(cells),
+        counts=gathered.counts, dust=gathered.dust, uncovered=uncovered,
+    )  # fmt: skip
 
 
 def _figures(
-    smooth: SmoothTerms,
-    zernike: ZernikeFit,
-    cells: GridCells,
-    bands: Bands,
-    outline: Aperture,
-    even: bool,
-    gaps: Gaps | None,
-) -> tuple[dict[str, UncertainValue], dict[str, UncertainValue]]:
+    smooth: SmoothTerms, zernike: ZernikeFit, cells: GridCells, bands: Bands, outline: Aperture,
+    even: bool, gaps: Gaps | None,
+) -> tuple[dict[str, UncertainValue], dict[str, UncertainValue]]:  # fmt: skip
     """Return figures of the map, and its texture with slopes;  cells: of it."""
     map_, rest = smooth.map, smooth.without(SECOND_ORDER)
     rest_cells = GridCells.of(rest, even=even)
@@ -355,18 +343,10 @@ class _Gathered:
         rows = np.ascontiguousarray(self._kept.rows().T)
         noise, known, error = self._point_noise(rows, found.noise)
         return DeviationMap(
-            x=rows[0],
-            y=rows[1],
-            deviation=rows[2],
-            area=area,
-            effects=rows[3:],
-            noise=noise,
-            noise_known=known,
-            noise_error=error,
+            x=rows[0], y=rows[1], deviation=rows[2], area=area, effects=rows[3:], noise=noise,
+            noise_known=known, noise_error=error, moves=found.moves, taken=found.taken,
             bounds=len(found.pose_effects) + np.array(bounds, np.int64),
-            moves=found.moves,
-            taken=found.taken,
-        )
+        )  # fmt: skip
 
     def as_measured(self, map_: DeviationMap) -> dict[str, UncertainValue]:
         """Return figures of the points, with noise and systematic errors."""

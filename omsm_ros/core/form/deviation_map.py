@@ -66,6 +66,12 @@ class DeviationMap:
         """Return every k-th point, so that there are no more than ``most``."""
         return self.part(slice(None, None, -(-len(self) // most)))
 
+    def equal_areas(self, most: int) -> IntArray:
+        """Return the indices of ``most`` points, or all, that stand for equal areas."""
+        ends, count = np.cumsum(self.area), min(most, len(self))
+        begins = np.arange(count) / count * ends[-1] * (1 + 1e-12)  # rounding of the sums
+        return np.asarray(np.searchsorted(ends, begins, "right"))
+
     def part(self, chosen: slice | IntArray) -> DeviationMap:
         """Return the ``chosen`` points."""
         names = ("x", "y", "deviation", "area", "effects")
@@ -227,21 +233,19 @@ class GridCells:
             np.asarray(values.min() + step * (np.arange(count) + 0.5 - before), np.float64)
             for values, step, count in zip((map_.x, map_.y), steps, reversed(shape), strict=True)
         )
+        width = float(np.sqrt(12 * np.mean(np.square(across)))) if across else 0.0
         return cls(
-            x=x,
-            y=y,
-            steps=steps,
-            present=(counts > 0).reshape(shape),
-            mean=mean(map_.deviation).reshape(shape),
-            noise=(map_.noise / np.sqrt(divisor)).reshape(shape),
+            x=x, y=y, steps=steps, present=(counts > 0).reshape(shape),
+            mean=mean(map_.deviation).reshape(shape), offset=offset.reshape(2, *shape),
+            noise=(map_.noise / np.sqrt(divisor)).reshape(shape), width=width,
             effects=np.array([mean(e) for e in map_.effects]).reshape(-1, *shape),
-            offset=offset.reshape(2, *shape),
-            width=float(np.sqrt(12 * np.mean(np.square(across)))) if across else 0.0,
             noise_known=map_.noise_known and not even,
-        )
+        )  # fmt: skip
 
-    def planes(self, cutoffs: tuple[float, float]) -> Callable[[FloatArray], FloatArray]:
+    def planes(self, cutoffs: tuple[float, float]) -> Callable[..., FloatArray]:
         """Return a low-pass: of images (k, r, c) level [m] and slopes [1] along x, y (3, k, r, c).
+
+        Given numbers from 0 to 2, too, it returns only those of the three.
 
         Weighted linear regression with Gaussians of ``cutoffs`` along x and y [m] (ISO 16610-28).
         Inside the map it is the Gaussian filter of ISO 16610-61, its slopes are the derivatives.
@@ -260,19 +264,22 @@ class GridCells:
             products[k] -= middle[axis] * products[0]
         for k, axis in enumerate(ways, 1):
             products[:, k] -= middle[axis] * products[:, 0]
-        gram = np.moveaxis(products, (0, 1), (2, 3))
-        weight = np.where(self.present, gram[..., 0, 0], 1.0)
-        gram = gram + (_LEAST_SPREAD * weight)[..., np.newaxis, np.newaxis] * np.eye(len(basis))
-        solve = np.moveaxis(np.linalg.inv(gram), (2, 3), (0, 1)) * self.present
+        weight = np.where(self.present, products[0, 0], 1.0)
+        products[range(len(basis)), range(len(basis))] += _LEAST_SPREAD * weight
+        solve = _inverses(products) * self.present
+        rows = {2 - axis: (solve[k], self.steps[1 - axis]) for k, axis in enumerate(ways, 1)}
+        rows[0] = solve[0], 1.0
 
-        def fitted(images: FloatArray) -> FloatArray:
+        def fitted(images: FloatArray, kinds: Sequence[int] = (0, 1, 2)) -> FloatArray:
             right = _blurred(basis[:, np.newaxis] * images, narrow)
             for k, axis in enumerate(ways, 1):
                 right[k] -= middle[axis] * right[0]
-            planes = [np.sum(row[:, np.newaxis] * right, axis=0) for row in solve]
-            found = np.stack([planes[0], *2 * [np.zeros(images.shape)]])
-            for k, axis in enumerate(ways, 1):
-                found[2 - axis] = planes[k] / self.steps[1 - axis]
+            found = np.zeros((len(kinds), *images.shape))
+            for plane, kind in zip(found, kinds, strict=True):
+                row, step = rows.get(kind, ((), 1.0))
+                for share, product in zip(row, right, strict=False):  # no slope along one cell
+                    plane += share * product
+                plane /= step
             return found
 
         return fitted
@@ -342,6 +349,18 @@ def gaussian_weights(size: int, cutoff: float) -> FloatArray:
     apart = np.subtract.outer(np.arange(size), np.arange(size)) / (_ALPHA * cutoff)
     # Products with smaller weights have few digits, and take five times as long.
     return np.asarray(np.exp(-np.minimum(np.pi * apart**2, 100.0)))
+
+
+def _inverses(matrices: FloatArray) -> FloatArray:
+    """Return the inverses of positive definite ``matrices`` (k, k, …): Gauss-Jordan for all."""
+    found = matrices.copy()
+    for k in range(len(found)):
+        pivot, row = found[k, k].copy(), found[k].copy()
+        column = found[:, k] / pivot
+        found -= column[:, np.newaxis] * row
+        found[k], found[:, k] = row / pivot, -column
+        found[k, k] = 1 / pivot
+    return found
 
 
 def _blurred(images: FloatArray, cutoffs: Sequence[float]) -> FloatArray:

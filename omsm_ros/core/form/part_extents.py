@@ -141,14 +141,14 @@ class _PartForm(NamedTuple):
     ) -> tuple[UncertainValue, UncertainValue]:
         """Return the extents of the ``map_`` whose form differs by a smooth ``shift`` (n,) [m]."""
         form = self.value + shift
-        even = _equal_areas(map_.area, _MOST_DRAWN)
+        even = map_.equal_areas(_MOST_DRAWN)
         order = self.local[np.argsort(form[self.local])]
         some = np.concatenate([even, order[:_HALF], order[-_HALF:]])
         drawn = _drawn(map_.part(some), self, form[some], some)
         beyond, alone = gaps.beyond(self, form) if gaps else np.zeros((2, 2))
         of_waves = [np.max(way * form + self.texture) - np.max(way * form) for way in (-1, 1)]
         found = []
-        many = form[_equal_areas(map_.area, _MOST_FITTED)]
+        many = form[map_.equal_areas(_MOST_FITTED)]
         shares = ((0.0, 1.0), form, len(some)), (ROBUST, many, len(even))
         for ends, all_, count in shares[: 1 + robust]:
             of_some, *ways = (_extents(way[:count], ends) for way in (form[some], *drawn))
@@ -176,13 +176,6 @@ def _extents(values: FloatArray, ends: tuple[float, float]) -> FloatArray:
     if ends != (0.0, 1.0):
         values = np.quantile(values, ends, axis=0, method="hazen")
     return np.asarray(np.ptp(values, axis=0))
-
-
-def _equal_areas(area: FloatArray, most: int) -> IntArray:
-    """Return the indices of ``most`` points, or all, that stand for equal shares of ``area``."""
-    ends, count = np.cumsum(area), min(most, len(area))
-    begins = np.arange(count) / count * ends[-1] * (1 + 1e-12)  # rounding of the sums
-    return np.asarray(np.searchsorted(ends, begins, "right"))
 
 
 class Gaps(NamedTuple):
@@ -291,9 +284,9 @@ class Gaps(NamedTuple):
 
     def _about(self, peak: int) -> tuple[IntArray, NDArray[np.complex128]]:
         """Return the points (k,) about a ``peak``, and their places in distances of the tracks."""
-        near = np.flatnonzero(np.abs(self.x - self.x[peak]) < _AWAY[1] * self.spacing)
-        at = (self.x[near] - self.x[peak]) + 1j * (self.y[near] - self.y[peak])
-        at /= self.spacing
+        reach, middle = _AWAY[1] * self.spacing, self.x[peak]
+        near = np.flatnonzero((self.x > middle - reach) & (self.x < middle + reach))
+        at = ((self.x[near] - middle) + 1j * (self.y[near] - self.y[peak])) / self.spacing
         about = np.abs(at) < _AWAY[1]
         return near[about], at[about]
 
@@ -345,22 +338,28 @@ def _local_features(
     has the means of the sizes with the least expected error (Stein); all cells have, if the means
     of one size are closer than none all over the map, as for ripple.
     """
-    rest, levels, ripple = map_.deviation - smooth, _cells(map_, shift), False
+    rest, (column, row), ripple = map_.deviation - smooth, _finest_cells(map_, shift), False
+    shape = [((int(v.max()) >> _HALVINGS + 1) + 1) << _HALVINGS + 1 for v in (column, row)]
+    place, size = column * shape[1] + row, shape[0] * shape[1]
+    counts, sums = (np.bincount(place, w, size).reshape(shape) for w in (None, rest))
     differs = np.abs(rest) > _beyond_chance(len(map_)) * map_.noise
-    for cell in levels:
-        mean, error = _cell_means(cell, rest, map_.noise)
-        count, ratio = int(np.count_nonzero(error)), mean / np.where(error > 0, error, np.inf)
-        if np.any(high := np.abs(ratio) > _beyond_chance(count)):
-            differs |= high[cell]
+    for k in range(_HALVINGS + 1):
+        count, ratio = int(np.count_nonzero(counts)), sums / np.sqrt(np.maximum(counts, 1))
+        if np.any(high := np.abs(ratio) > _beyond_chance(count) * map_.noise):
+            differs |= high[column >> k, row >> k]
         # Σ (mean / error)² of noise alone is χ² with as many degrees of freedom as cells.
-        ripple |= float(ratio @ ratio) - 2 * count > _CHANCE * np.sqrt(2 * count)
+        square = float(np.sum(ratio**2)) / max(map_.noise**2, _TINY)
+        ripple |= square - 2 * count > _CHANCE * np.sqrt(2 * count)
+        # Four cells make one of the next size.
+        counts, sums = (v.reshape(len(v) // 2, 2, -1, 2).sum(axis=(1, 3)) for v in (counts, sums))
+    largest = _numbers(column, row, _HALVINGS)
     # Without noise there is nothing to average.
-    chosen = ((np.bincount(levels[0], differs) > 0) | ripple) & (map_.noise > 0)
-    some = np.flatnonzero(chosen[levels[0]])
+    chosen = ((np.bincount(largest, differs) > 0) | ripple) & (map_.noise > 0)
+    some = np.flatnonzero(chosen[largest])
     if not len(some):
         return some, np.empty(0), some, np.empty(0)
-    cells = [_renumbered(level[some]) for level in levels]
-    cells.append(np.arange(len(some)))
+    levels = (_numbers(column[some], row[some], k) for k in range(_HALVINGS, -1, -1))
+    cells = [*map(_renumbered, levels), np.arange(len(some))]
     best = _least_risk(cells, rest[some], map_.noise)
     firsts = np.cumsum([0, *(int(cell.max()) + 1 for cell in cells[:-1])])
     own = np.stack(cells)[best, np.arange(len(some))] + firsts[best]
@@ -368,17 +367,18 @@ def _local_features(
     return some, smooth[some] + mean[own], own, error[own]
 
 
-def _cells(map_: DeviationMap, shift: float = 0.0) -> list[IntArray]:
-    """Return the numbers of the square cell of each point (n,), each with half the last one's side.
-
-    shift: of the grid in the largest cells, whose side is eight mean distances of the points
-    """
+def _finest_cells(map_: DeviationMap, shift: float = 0.0) -> tuple[IntArray, IntArray]:
+    """Return column and row of the smallest cells, each (n,);  shift: in the largest cells."""
+    # These are eight mean distances of the points wide.
     spans = np.array([np.ptp(map_.x), np.ptp(map_.y)])
     side = 8 * float(np.sqrt(np.prod(np.maximum(spans, 1e-3 * spans.max())) / len(map_)))
-    places = (((v - v.min()) / side + shift) * 2**_HALVINGS for v in (map_.x, map_.y))
-    column, row = (place.astype(np.int64) for place in places)
-    most, halvings = int(row.max()), reversed(range(_HALVINGS + 1))
-    return [(column >> k) * ((most >> k) + 1) + (row >> k) for k in halvings]
+    x, y = (((v - v.min()) / side + shift) * 2**_HALVINGS for v in (map_.x, map_.y))
+    return x.astype(np.int64), y.astype(np.int64)
+
+
+def _numbers(column: IntArray, row: IntArray, halvings: int) -> IntArray:
+    """Return the numbers (n,) of the cells that hold 2^``halvings`` rows and columns."""
+    return (column >> halvings) * ((int(row.max()) >> halvings) + 1) + (row >> halvings)
 
 
 def _renumbered(cell: IntArray) -> IntArray:
@@ -392,7 +392,7 @@ def _texture(map_: DeviationMap, rest: FloatArray) -> FloatArray:
     Fine waves, as of a fingerprint, scatter the points of a cell without a change of its mean. That
     may also be noise, which is larger there.
     """
-    cell = _cells(map_)[0]
+    cell = _numbers(*_finest_cells(map_), _HALVINGS)
     counts = np.bincount(cell)
     square, _ = _cell_means(cell, rest**2, 0.0)
     # R. A. Fisher's √(2 χ²) is nearly normal.

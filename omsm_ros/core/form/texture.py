@@ -191,10 +191,10 @@ def _planes(
         fit = cells.planes(cutoff)
         of_noise = fit(noise)
         for k, (planes, image) in enumerate(zip(found, images, strict=True)):
-            rows, image = slice(k < steep, 3 if k < steep else 1), image[:1] if planes else image
+            kinds, image = [1, 2] if k < steep else [0], image[:1] if planes else image
             few = np.split(image, range(_AT_A_TIME, len(image), _AT_A_TIME))
-            own = np.concatenate([fit(part)[rows] for part in few], axis=1)
-            planes.append(np.concatenate([own[:, :1], of_noise[rows], own[:, 1:]], axis=1))
+            own = np.concatenate([fit(part, kinds) for part in few], axis=1)
+            planes.append(np.concatenate([own[:, :1], of_noise[kinds], own[:, 1:]], axis=1))
     return found
 
 
@@ -344,7 +344,7 @@ def power_density(cells: GridCells) -> PowerDensity:
     image = cells.mean
     if cells.width > 0:
         # The mean position of the points is not the middle of the cell.
-        steep = cells.planes(_cutoffs(cells, None)[0])(image[np.newaxis])[1:]
+        steep = cells.planes(_cutoffs(cells, None)[0])(image[np.newaxis], (1, 2))
         steps = np.reshape(cells.steps, (2, 1, 1))
         image = image - np.sum(steep[:, 0] * cells.offset[::-1] * steps, axis=0)
     # The mean under the window would leak into the lowest frequencies.

@@ -306,15 +306,9 @@ def separable(gram: FloatArray, terms: Sequence[ZernikeIndex], condition: float)
 
 
 def _scores(
-    x: FloatArray,
-    y: FloatArray,
-    deviation: FloatArray,
-    coefficients: FloatArray,
-    terms: Sequence[ZernikeIndex],
-    disc: Aperture,
-    weights: FloatArray | None,
-    inverse: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+    x: FloatArray, y: FloatArray, deviation: FloatArray, coefficients: FloatArray,
+    terms: Sequence[ZernikeIndex], disc: Aperture, weights: FloatArray | None, inverse: FloatArray,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Return the covariance (k, k) of columns times residual, by groups and by single points.
 
     Groups are passes of the path. Where the path resolves form that the terms do not describe, the
@@ -346,7 +340,6 @@ def _scores(
         columns = zernike_values(*disc.scaled(x[chunk], y[chunk]), terms)
         residual = deviation[chunk] - coefficients @ columns
         weighted = columns if weights is None else columns * weights[chunk]
-        products = weighted * residual
         rough = residual
         if differences and len(residual) > 2:  # the noise along the path
             rough = np.pad(np.diff(residual, 2) / np.sqrt(6), 1, "edge")
@@ -355,7 +348,7 @@ def _scores(
         sizes = ends[groups] - begins[groups]
         if np.any(shown[groups] < 1):
             missed += alone * np.repeat(1 - shown[groups], sizes) @ alone.T
-        sums[:, groups] = _group_sums(products, columns, weighted, inverse, sizes)
+        sums[:, groups] = _group_sums(residual, columns, weighted, inverse, sizes)
         first = last
     scatter = np.diff(sums, differences, axis=1) / np.sqrt(comb(2 * differences, differences))
     scatter = _over_groups(scatter, single - missed, differences) + missed
@@ -378,24 +371,24 @@ def _over_groups(sums: FloatArray, alone: FloatArray, differences: int) -> Float
 
 
 def _group_sums(
-    products: FloatArray,
-    columns: FloatArray,
-    weighted: FloatArray,
-    inverse: FloatArray,
+    residual: FloatArray, columns: FloatArray, weighted: FloatArray, inverse: FloatArray,
     sizes: IntArray,
-) -> FloatArray:
-    """Return sums of ``products`` (k, n) over groups (k, g), for the fit to all other groups.
+) -> FloatArray:  # fmt: skip
+    """Return sums of products over groups (k, g), for the fit to all other groups.
 
+    residual: (n,);  columns, weighted: those of the fit, and times their weights (k, n)
     sizes: points of each group (g,)
     """
-    begins = np.cumsum(sizes) - sizes
-    followed = np.add.reduceat(products, begins, axis=1)
-    sums = followed
-    for _ in range(_FOLLOWED):
-        along = np.einsum("kn,kn->n", np.repeat(inverse @ followed, sizes, axis=1), columns)
-        followed = np.add.reduceat(weighted * along, begins, axis=1)
-        sums = sums + followed
-    return np.asarray(sums, np.float64)
+    if np.max(sizes) == 1:
+        share = np.einsum("kn,kn->n", inverse @ weighted, columns)
+        return np.asarray(weighted * residual * sum(share**k for k in range(_FOLLOWED + 1)))
+    sums, ends = np.zeros((len(columns), len(sizes))), np.cumsum(sizes)
+    for own, begin, end in zip(sums.T, ends - sizes, ends, strict=True):
+        part, along = slice(begin, end), residual[begin:end]
+        for _ in range(_FOLLOWED + 1):
+            own += (followed := weighted[:, part] @ along)
+            along = (inverse @ followed) @ columns[:, part]
+    return sums
 
 
 def _with_variance_floor(covariance: FloatArray, floor: FloatArray) -> FloatArray:

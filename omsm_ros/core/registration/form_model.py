@@ -116,7 +116,11 @@ class FormBasis:
 
     def columns(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the polynomials (k, n) at x, y (n,) [m], with their usual rms over the area."""
-        return np.asarray(self.mix @ zernike_values(*self.disc.scaled(x, y), _TERMS), np.float64)
+        return np.asarray(self.mix @ self.terms(x, y), np.float64)
+
+    def terms(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the Zernike terms (45, n) at x, y (n,) [m] of which ``mix`` makes the columns."""
+        return zernike_values(*self.disc.scaled(x, y), _TERMS)
 
 
 class FormNormalEquations:
@@ -134,23 +138,29 @@ class FormNormalEquations:
         self.gram, self.scores = np.zeros((columns, columns + 1 + sources)), np.zeros(columns)
 
     def add(self, columns: FloatArray, deviation: FloatArray, systematic: FloatArray,
-            residual: FloatArray, near: BoolArray | None = None,
-            gram: FloatArray | None = None) -> None:  # fmt: skip
+            residual: FloatArray, near: BoolArray | None = None, gram: FloatArray | None = None,
+            mix: FloatArray | None = None) -> None:  # fmt: skip
         """Add points: columns (q, n), deviation (n,), systematic (s, n), residual (n,).
 
         near: which of them to add (n,), None for all;  gram: of their columns (q, q) if it is known
+        mix: weights (q, k) of ``columns`` (k, n) whose sums are the columns, if they are not
         """
         if near is not None and not np.all(near):
             columns, systematic = columns[:, near], systematic[:, near]
             deviation, residual = deviation[near], residual[near]
-        self.gram[:, : self.columns] += columns @ columns.T if gram is None else gram
-        self.gram[:, self.columns :] += columns @ np.vstack([deviation, systematic]).T
+        gram = columns @ columns.T if gram is None else gram
+        right = columns @ np.vstack([deviation, systematic]).T
+        whole = len(residual) // GROUP * GROUP
+        groups = columns[:, :whole].reshape(len(columns), -1, GROUP).swapaxes(0, 1)
+        by_group = (groups @ residual[:whole].reshape(-1, GROUP, 1))[..., 0].T
+        by_group = np.column_stack([by_group, columns[:, whole:] @ residual[whole:]])
+        if mix is not None:  # the products of few sums, instead of those of all points
+            gram, right, by_group = mix @ gram @ mix.T, mix @ right, mix @ by_group
+        self.gram += np.concatenate([gram, right], axis=1)
+        self.scores += np.sum(by_group**2, axis=1)
         self.points += len(deviation)
         self.square += float(residual @ residual)
         self.total += float(deviation @ deviation)
-        for begin in range(0, len(residual), GROUP):
-            group = slice(begin, begin + GROUP)
-            self.scores += (columns[:, group] @ residual[group]) ** 2
 
 
 class Estimate(NamedTuple):

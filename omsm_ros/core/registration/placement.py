@@ -6,7 +6,7 @@ high. Its derivative by the pose is the normal times the motion of the point in 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, TypeAlias
 
@@ -43,6 +43,11 @@ class PointBatch(NamedTuple):
     y: FloatArray
     height: FloatArray
     systematic: FloatArray
+
+    def chunks(self, most: int) -> Iterator[PointBatch]:
+        """Yield these points in parts of at most ``most``, which fit the processor's cache."""
+        for begin in range(0, len(self.x), most):
+            yield PointBatch(*(v[..., begin : begin + most] for v in self))
 
 
 PointBatches: TypeAlias = Callable[[], Iterable[PointBatch]]
@@ -118,28 +123,31 @@ def placed(surface: Surface, placement: Placement, portion: PointBatch) -> Place
     from the tangent plane there, exact to first order in deviation times curvature.
     """
     pose, nominal, surface = placement.pose, surface, placement.of(surface)
-    away = np.stack([portion.x, portion.y, portion.height]) - pose.origin[:, np.newaxis]
+    away = np.stack([portion.x, portion.y, portion.height])
+    away -= pose.origin[:, np.newaxis]
     x, y, z = pose.rotation.T @ away
-    half_power = placement.power / 2
-    slope_x, slope_y = _slopes(surface, half_power, x, y)
-    above = z - surface.height(x, y) - half_power * (x**2 + y**2)
-    reach = above / (1 + slope_x**2 + slope_y**2)
+    slope_x, slope_y, height = _slopes_and_height(surface, placement.power, x, y)
+    reach = (z - height) / (1 + slope_x**2 + slope_y**2)
     foot_x, foot_y = x + reach * slope_x, y + reach * slope_y
-    slope_x, slope_y = _slopes(surface, half_power, foot_x, foot_y)
+    slope_x, slope_y, height = _slopes_and_height(surface, placement.power, foot_x, foot_y)
     normal = unit_normal(slope_x, slope_y)
-    foot_z = surface.height(foot_x, foot_y) + half_power * (foot_x**2 + foot_y**2)
-    deviation = (x - foot_x) * normal[0] + (y - foot_y) * normal[1] + (z - foot_z) * normal[2]
+    deviation = (x - foot_x) * normal[0]
+    deviation += (y - foot_y) * normal[1]
+    deviation += (z - height) * normal[2]
     by_shape = np.empty((0, len(x)))
     if placement.shape:
         by_shape = -normal[2] * shape_columns(nominal, dict(placement.shape), foot_x, foot_y)
-    return Placed(x, y, np.asarray(deviation), normal, away, by_shape)
+    return Placed(x, y, deviation, normal, away, by_shape)
 
 
-def _slopes(
-    surface: Surface, half_power: float, x: FloatArray, y: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    slope_x, slope_y = gradient_of(surface, x, y)
-    return np.asarray(slope_x + 2 * half_power * x), np.asarray(slope_y + 2 * half_power * y)
+def _slopes_and_height(
+    surface: Surface, power: float, x: FloatArray, y: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    (slope_x, slope_y), height = gradient_of(surface, x, y), surface.height(x, y)
+    if power:
+        height = height + power / 2 * (x**2 + y**2)
+        slope_x, slope_y = slope_x + power * x, slope_y + power * y
+    return np.asarray(slope_x), np.asarray(slope_y), np.asarray(height)
 
 
 def dof_columns(placement: Placement, points: Placed, dofs: Sequence[str]) -> FloatArray:

@@ -310,26 +310,28 @@ class _PoseFit:
 
         Returns those beyond the outlier limit; with ``far`` they are recorded there and not added.
         """
-        at, like = stand.at, stand.like
-        beyond = np.zeros(len(portion.x), bool)
-        for begin in range(0, len(portion.x), CHUNK):
-            part = PointBatch(*(v[..., begin : begin + CHUNK] for v in portion))
+        at, names, free = stand.at, tuple(self.dofs.held), len(self.dofs.fitted)
+        beyond, begin = np.zeros(len(portion.x), bool), 0
+        mix = np.eye(free + len(self.basis), free + self.basis.mix.shape[1])
+        mix[free:, free:] = self.basis.mix
+        like = stand.like @ mix
+        for part in portion.chunks(CHUNK):
             whole = placed(self.surface, at, part)
             good = np.isfinite(whole.deviation)
             if self.aperture is not None:
                 good &= self.aperture.holds(whole.x, whole.y)
             points = whole.part(good)
-            names = tuple(self.dofs.held)
             held = held_dof_effects(self.surface, at, points, names, held_effects)
             systematic = np.concatenate([part.systematic[:, good] * points.normal[2], held])
-            z = self.basis.columns(points.x, points.y)
-            columns = np.concatenate([-dof_columns(at, points, self.dofs.fitted), z])
+            terms = self.basis.terms(points.x, points.y)
+            columns = np.concatenate([-dof_columns(at, points, self.dofs.fitted), terms])
             residual = points.deviation - like @ columns
             near = None
             if far is not None:
                 near = ~far.add(points, residual, good)
                 beyond[begin + np.flatnonzero(good)[~near]] = True
-            sums.add(columns, points.deviation, systematic, residual, near)
+            sums.add(columns, points.deviation, systematic, residual, near, mix=mix)
+            begin += len(good)
         return PointBatch(*(v[..., beyond] for v in portion))
 
     def solved(self, at: Placement, sums: FormNormalEquations) -> tuple[Estimate, float]:
@@ -401,9 +403,10 @@ def _over_all(
     square, points, far, beyond = 0.0, 0.0, FarPoints(stand.limit), []
     for portion in portions():
         beyond.append(fit.sums(stand, portion, held, sums, far))
-        before = placed(stand.at.of(fit.surface), Placement(), portion).deviation
-        square += float(np.nansum(before**2))
-        points += float(np.sum(np.isfinite(before)))
+        for part in portion.chunks(CHUNK):
+            before = placed(stand.at.of(fit.surface), Placement(), part).deviation
+            square += float(np.nansum(before**2))
+            points += float(np.sum(np.isfinite(before)))
     left_out, form = far.dust(dust)
     for portion in beyond:
         chosen, form = form[: len(portion.x)], form[len(portion.x) :]
@@ -415,22 +418,10 @@ def _over_all(
     by_source = open_.by_source(fit.dofs.fitted, covariance, names, moved)
     at = stand.at.moved(fit.dofs.fitted, found.step)
     return Registration(
-        surface=at.of(fit.surface),
-        placement=at,
-        dofs=fit.dofs,
-        from_source=by_source,
-        pose_effects=root_of(covariance),
-        taken=shares_of(root_of(covariance), found.likely),
-        held_effects=held,
-        moved=moved,
-        spread=open_.spread(fit.dofs, by_source),
-        correlated_moves=open_.unknown,
-        limit=stand.limit,
-        dust=left_out,
-        spacing=far.space().spacing,
-        disc=disc,
-        basis=fit.basis,
-        form=found.form,
-        noise=float(np.sqrt(variance)),
-        before=float(np.sqrt(square / max(points, 1.0))),
-    )
+        surface=at.of(fit.surface), placement=at, dofs=fit.dofs, from_source=by_source,
+        pose_effects=root_of(covariance), taken=shares_of(root_of(covariance), found.likely),
+        held_effects=held, moved=moved, spread=open_.spread(fit.dofs, by_source),
+        correlated_moves=open_.unknown, limit=stand.limit, dust=left_out,
+        spacing=far.space().spacing, disc=disc, basis=fit.basis, form=found.form,
+        noise=float(np.sqrt(variance)), before=float(np.sqrt(square / max(points, 1.0))),
+    )  # fmt: skip

@@ -103,10 +103,14 @@ def jacobi(
     yield value, slope
     for k in range(highest):
         a, b, c = _jacobi_step(k, alpha, beta)
-        factor = a * t + b
+        factor = a * t
+        factor += b
         if slopes:
             slope, before_slope = factor * slope + a * value - c * before_slope, slope
-        value, before = factor * value - c * before, value
+        if k:  # else P_0 is one, and nothing is before it
+            factor *= value
+            factor -= c * before
+        value, before = factor, value
         yield value, slope
 
 
@@ -126,12 +130,17 @@ def zernike_values(x: FloatArray, y: FloatArray, terms: Sequence[ZernikeIndex]) 
     real, imaginary = np.ones_like(t), np.zeros_like(t)
     groups = _by_angle(terms)
     for m in range(max(groups, default=0) + 1):
+        if m:
+            real, imaginary = real * x - imaginary * y, real * y + imaginary * x
         wanted = groups.get(m, ())
-        radial = [value for value, _ in jacobi(t, 0, m, max((k for _, k, _ in wanted), default=0),
-                                                False)] if wanted else []  # fmt: skip
+        radial = [v for v, _ in jacobi(t, 0, m, max((k for _, k, _ in wanted), default=0), False)]
         for place, k, sine in wanted:
-            np.multiply(radial[k], imaginary if sine else real, out=made[place])
-        real, imaginary = real * x - imaginary * y, real * y + imaginary * x
+            # P_0 and the real part for m = 0 are one.
+            angular = imaginary if sine else real
+            if k and m:
+                np.multiply(radial[k], angular, out=made[place])
+            else:
+                made[place] = radial[k] if k else angular
     return made
 
 

@@ -109,14 +109,9 @@ def _draw_map(
     low, high = limits or symmetric_limits(raster)
     left, right, bottom, top = (edge / MILLIMETRE_M for edge in raster.extent)
     image = axes.imshow(
-        raster.image / scale,
-        origin="lower",
-        extent=(left, right, bottom, top),
-        cmap=style.MAP_COLOURS,
-        vmin=low / scale,
-        vmax=high / scale,
-        interpolation="nearest",
-    )
+        raster.image / scale, origin="lower", extent=(left, right, bottom, top),
+        cmap=style.MAP_COLOURS, vmin=low / scale, vmax=high / scale, interpolation="nearest",
+    )  # fmt: skip
     if not 1 / _NARROW < (top - bottom) / (right - left) < _NARROW:
         axes.set_aspect("auto")  # a strip would be a line
         title = f"{title}, not to scale"
@@ -402,12 +397,8 @@ def radial_density(curve: Mapping[str, Any]) -> Figure:
     _draw_curve(ax, curve, 1 / MILLIMETRE_M, _AREAL_UNIT, floor=floor)
     style.logarithmic(ax.xaxis, every=(1.0, 2.0, 5.0))
     style.logarithmic(ax.yaxis)
-    style.label(
-        ax,
-        x="spatial frequency [1/mm]",
-        y="density [nm² mm²]",
-        title="Power spectral density over frequency",
-    )
+    title = "Power spectral density over frequency"
+    style.label(ax, x="spatial frequency [1/mm]", y="density [nm² mm²]", title=title)
     return made
 
 
