@@ -350,8 +350,8 @@ def _local_features(
         # Σ (mean / error)² of noise alone is χ² with as many degrees of freedom as cells.
         square = float(np.sum(ratio**2)) / max(map_.noise**2, _TINY)
         ripple |= square - 2 * count > _CHANCE * np.sqrt(2 * count)
-        # Four cells make one of the next size.
-        counts, sums = (v.reshape(len(v) // 2, 2, -1, 2).sum(axis=(1, 3)) for v in (counts, sums))
+        halves = (v[::2] + v[1::2] for v in (counts, sums))
+        counts, sums = (v[:, ::2] + v[:, 1::2] for v in halves)  # four cells make one
     largest = _numbers(column, row, _HALVINGS)
     # Without noise there is nothing to average.
     chosen = ((np.bincount(largest, differs) > 0) | ripple) & (map_.noise > 0)

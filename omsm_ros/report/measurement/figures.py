@@ -49,15 +49,9 @@ def symmetric_limits(raster: Raster) -> Limits:
 
 
 def deviation_map(
-    x: FloatArray,
-    y: FloatArray,
-    deviation: FloatArray,
-    *,
-    unit: str,
-    title: str,
-    limits: Limits | None = None,
-    quantity: str = "deviation",
-) -> Figure:
+    x: FloatArray, y: FloatArray, deviation: FloatArray, *, unit: str, title: str,
+    limits: Limits | None = None, quantity: str = "deviation",
+) -> Figure:  # fmt: skip
     """Draw a deviation or other ``quantity`` (n,) [m] over the workpiece as colours in ``unit``.
 
     unit: "nm", "µm" or "mm"
@@ -130,16 +124,10 @@ def _draw_map(
 
 
 def profile(
-    above: Mapping[str, Profile],
-    below: Profile,
-    *,
-    title: str,
-    position: str,
-    unit: str,
-    height: str = "deviation",
-    lower: tuple[str, str] = ("", style.AFTER),
+    above: Mapping[str, Profile], below: Profile, *, title: str, position: str, unit: str,
+    height: str = "deviation", lower: tuple[str, str] = ("", style.AFTER),
     band: Profile | None = None,
-) -> Figure:
+) -> Figure:  # fmt: skip
     """Draw two profiles by their names in ``unit``, and below them another in nm.
 
     position, height: names of the axes, the horizontal one in mm
