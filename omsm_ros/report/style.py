@@ -34,8 +34,8 @@ _NAME_LEFT_OF_AXES_IN = 0.58
 TEXT_PT = 8.5
 TITLE_PT = 10.0
 FIGURE_DPI = 180
-# Level 4 is twice as fast as the default 6, and files are a few per cent larger.
-FAST_PNG = {"compress_level": 4}
+# Level 3 takes half the time of the default 6, and files are a tenth larger.
+FAST_PNG = {"compress_level": 3}
 
 
 def empty(width: float, height: float) -> Figure:

@@ -161,7 +161,7 @@ def _nearest(x: FloatArray, y: FloatArray, outline: Aperture | None) -> tuple[In
     # Morphological closing (Serra 1982) with a disc: dilation followed by erosion.
     margin = int(np.ceil(reach)) + 1
     wide = np.pad(filled, margin)
-    far, nearest = ndimage.distance_transform_edt(~wide, return_indices=True)
+    nearest = ndimage.distance_transform_edt(~wide, return_distances=False, return_indices=True)
     inside = np.ones(wide.shape, bool)
     if outline is not None:
         # The middles of the tiles, with a margin around.
@@ -170,7 +170,7 @@ def _nearest(x: FloatArray, y: FloatArray, outline: Aperture | None) -> tuple[In
             for v, n in zip((x, y), shape, strict=True)
         ]
         inside = outline.holds(*np.meshgrid(*middles, indexing="ij"))
-        far = ndimage.distance_transform_edt(inside & ~wide)
+    far = ndimage.distance_transform_edt(inside & ~wide)
     scanned = (ndimage.distance_transform_edt(far <= reach) > reach) & inside | wide
     row, column = (places[scanned] - margin for places in nearest)
     owner = row * shape[1] + column
