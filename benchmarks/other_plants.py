@@ -11,6 +11,7 @@ import numpy as np
 
 from benchmarks.against_truth import band_held, inside, mass_errors, mode_errors, over_stated, worst
 from benchmarks.identification import record_once, rms, seeds
+from benchmarks.recorded import two_mass_response
 from benchmarks.row import Row, at_least, at_most, between
 from benchmarks.step_test import StepTest
 from omsm_ros.core.calibration.calibration import Calibration
@@ -64,7 +65,7 @@ def wrong_orders(runs: int) -> list[Row]:
     for order, truth, name in (
         (3, first_order, "first order as third"),
         (1, LONE_MODE, "60 Hz mode as first order"),
-        (2, MACHINE.non_collocated(), "two masses as second order"),
+        (2, two_mass_response(MACHINE, collocated=False), "two masses as second order"),
         (1, Plant().dynamics, "Eq. 12 as first order"),
     ):
         table += band_held(name, identified(truth, runs, order), truth)
@@ -75,7 +76,7 @@ def two_masses(runs: int) -> list[Row]:
     """Return errors of modes, masses, springs and dampers over their stated uncertainty."""
     table = []
     for name in ("non-collocated", "collocated"):
-        truth = MACHINE.collocated() if name == "collocated" else MACHINE.non_collocated()
+        truth = two_mass_response(MACHINE, collocated=name == "collocated")
         found = identified(truth, runs)
         for index, mode in enumerate(known_modes(truth)):
             what = f"frequency of {mode.frequency:.0f} Hz mode, {name}"

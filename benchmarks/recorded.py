@@ -2,8 +2,15 @@
 
 import numpy as np
 
+from omsm_ros.core.lti.modes import TwoMass
+from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.motion_record import MotionRecord
+
+
+def two_mass_response(masses: TwoMass, *, collocated: bool) -> TransferFunction:
+    """Return the motion of the driven m1, or of m2 (Eq. 7), scaled to G(0) = 1."""
+    return TransferFunction.from_ascending(*masses.polynomials(collocated=collocated)).normalised()
 
 
 def record_from_arrays(

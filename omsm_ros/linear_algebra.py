@@ -71,9 +71,9 @@ def inverse_root(
     tolerance: scaled directions weaker than this part of the strongest are lost in rounding
     keep: those count as the weakest that is not, instead of being left out
     """
-    scale = np.sqrt(np.maximum(np.diag(gram), 0.0))  # rounding may leave less than nothing
+    scale = np.sqrt(np.maximum(gram.diagonal(), 0.0))  # rounding may leave less than nothing
     scale[scale == 0] = 1.0
-    values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
+    values, directions = np.linalg.eigh(gram / np.multiply.outer(scale, scale))
     least = tolerance * np.max(values, initial=0.0)
     kept = (values > least) | keep
     values = np.maximum(values[kept], least)

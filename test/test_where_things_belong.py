@@ -18,7 +18,7 @@ from omsm_ros.core.calibration.certificate import REJECTS, WARNING, Finding
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
-from omsm_ros.core.identification import checks, covariance_terms, identify, response_uncertainty
+from omsm_ros.core.identification import checks, identify, response_uncertainty
 from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface import nominal
@@ -87,7 +87,7 @@ def test_what_the_data_cannot_show_is_added_in_core_identification(monkeypatch, 
         further[-1, -1] = (100e-6) ** 2
         return further
 
-    every = (*covariance_terms.COVARIANCE_TERMS, doubt)
+    every = (*response_uncertainty.COVARIANCE_TERMS, doubt)
     monkeypatch.setattr(response_uncertainty, "COVARIANCE_TERMS", every)
     after = identify.identify(motion, order=2).calibration
     added = after.covariance - before.covariance

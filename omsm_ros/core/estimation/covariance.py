@@ -1,12 +1,14 @@
 """Covariance of fitted parameters in coloured noise."""
 
+from math import log
+
 import numpy as np
 from scipy import fft, linalg, ndimage, signal
 
 from omsm_ros.core.estimation.model_structure import Fit
 from omsm_ros.core.estimation.noise import RandomWalk, scatter_in_time, uneven_rows, with_walk
 from omsm_ros.core.estimation.output_error import Problem
-from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.linear_algebra import basis_and_inverse
 
@@ -36,24 +38,26 @@ def autoregression(
         length = 2 * len(leverage) - 2
         power = np.abs(fft.rfft(residual, length)) ** 2 / np.maximum(1 - leverage, _LEAST_LEFT)
         lags = np.asarray(fft.irfft(power, length)[: highest + 1] / n)
-    coefficients, variance = np.append(1.0, np.zeros(highest)), float(lags[0])
-    if variance <= 0:
-        return coefficients[:1], 0.0
-    best, price = (n * np.log(variance), coefficients[:1].copy(), variance), np.log(n)
-    for order in range(1, highest + 1):
-        # Levinson's recursion.
-        reflection = -float(coefficients[:order] @ lags[order:0:-1]) / variance
-        coefficients[: order + 1] += reflection * coefficients[order::-1]
-        variance *= 1 - reflection**2
-        score = n * np.log(variance) + order * price
-        if score < best[0]:
-            best = (score, coefficients[: order + 1].copy(), variance)
+    known, coefficients, variance = lags.tolist(), [1.0], float(lags[0])
+    best = (np.inf, coefficients, max(variance, 0.0))
+    for order in range(highest + 1):
+        if order:  # Levinson's recursion; arrays of so few numbers would take several times as long
+            pairs = zip(coefficients, known[order:0:-1], strict=True)
+            reflection = -sum(a * lag for a, lag in pairs) / variance
+            longer = [*coefficients, 0.0]
+            coefficients = [a + reflection * b for a, b in zip(longer, longer[::-1], strict=True)]
+            variance *= 1 - reflection**2
+        if not variance > 0:
+            break
+        best = min(best, (n * log(variance) + order * log(n), coefficients, variance))
     return np.asarray(best[1]), best[2]
 
 
 def noise_spectrum(residual: FloatArray, length: int) -> FloatArray:
     """Return the autoregressive variance spectrum (``length`` // 2 + 1,) of a residual (n,)."""
     coefficients, variance = autoregression(residual)
+    if len(coefficients) == 1:
+        return np.full(length // 2 + 1, variance)
     return np.asarray(variance / np.abs(fft.rfft(coefficients, length)) ** 2)
 
 
@@ -84,18 +88,18 @@ def noise_before_fit(
     return np.asarray(even / np.abs(fft.rfft(whitening, length)) ** 2)
 
 
-def weighted_gram(rows: FloatArray, length: int, noise: FloatArray) -> FloatArray:
-    """Return the covariance (c, c) of ``rows`` (c, n) times noise of a variance spectrum.
+def weighted_gram(spectra: ComplexArray, length: int, noise: FloatArray) -> FloatArray:
+    """Return the covariance (c, c) of rows times noise of a variance spectrum.
 
-    noise: (``length`` // 2 + 1,), at the frequencies of a transform of ``length``
+    spectra: of the rows (c, k), transforms of ``length``; they are overwritten
+    noise: (k,), at the same frequencies
     """
     weight = np.sqrt(2.0 * noise / length)
     weight[0] *= np.sqrt(0.5)
     if length % 2 == 0:
         weight[-1] *= np.sqrt(0.5)
-    parts = np.empty((len(rows), 2 * len(weight)))
-    for row, part in zip(rows, parts, strict=True):
-        np.multiply(weight, fft.rfft(row, length), out=part.view(np.complex128))
+    spectra *= weight
+    parts = spectra.view(np.float64)
     return np.asarray(parts @ parts.T)
 
 
@@ -139,7 +143,8 @@ def parameter_covariance(
             moves = 2 * np.pi * frequency <= problem.rate * np.max(np.abs(problem.s))
             came = moves * np.abs(problem.noise * passed.response(frequency)) ** 2
             noise = np.maximum(noise, np.mean(own**2) - np.mean(came) + came)
-        score_covariance = score_covariance + weighted_gram(on_grid[:, part], length, noise)
+        spectra = fft.rfft(on_grid[:, part], length)
+        score_covariance = score_covariance + weighted_gram(spectra, length, noise)
     gram = columns.T @ columns
     scale = np.sqrt(np.diag(gram))
     scale[scale == 0] = 1.0

@@ -191,7 +191,7 @@ def fit(
     scaled = ScaledStructure(structure, problem.rate)
     box, lines = problem.box(scaled), part or problem.lines
     # Where the minimum is only explored, a gain within chance ends the search.
-    size, least_gain = (len(part.target), 1.0) if part else (len(problem.target), CONVERGED)
+    size, least_gain = (len(part.target), 1.0) if part else (len(problem.used), CONVERGED)
     now: Problem | CompressedProblem = lines or problem
 
     def project(nonlinear: FloatArray) -> Projection:

@@ -55,17 +55,17 @@ class ScaledStructure:
             for i in range(len(alpha))
         ]
 
-    def _delay(self, nonlinear: FloatArray) -> float:
-        return float(nonlinear[-1]) if self.structure.delay else 0.0
-
     def lag(self, nonlinear: FloatArray, s: ComplexArray) -> ComplexArray:
-        """Return L = e^{-τs} / denominator at scaled ``s`` (k,), (k,)."""
-        denominator = np.ones_like(s)
-        for section in self.sections(nonlinear):
-            denominator *= _section_at(section, s)
+        """Return L = e^{-τs} / denominator at scaled ``s`` = jω (k,), (k,)."""
+        first, *others = [_section_at(each, s) for each in self.sections(nonlinear)] or [
+            1.0 + 0 * s
+        ]
+        denominator = first
+        for other in others:
+            denominator *= other
         if not self.structure.delay:
             return np.asarray(1 / denominator)
-        return np.asarray(_delayed(s, self._delay(nonlinear)) / denominator)
+        return np.asarray(_delayed(s, float(nonlinear[-1])) / denominator)
 
     def lag_slopes(self, nonlinear: FloatArray, s: ComplexArray) -> ComplexArray:
         """Return d ln L / dψ (len ψ, k) at scaled ``s`` (k,), see :meth:`lag`."""
@@ -86,7 +86,7 @@ class ScaledStructure:
         return TransferFunction(
             numerator / self.rate ** np.arange(len(numerator)),
             denominator / self.rate ** np.arange(len(denominator)),
-            self._delay(nonlinear) / self.rate,
+            float(nonlinear[-1]) / self.rate if self.structure.delay else 0.0,
         )
 
     def coefficient_jacobian(self, nonlinear: FloatArray) -> FloatArray:
@@ -124,9 +124,12 @@ class ScaledStructure:
 
 
 def _section_at(section: FloatArray, s: ComplexArray) -> ComplexArray:
-    """Return 1 + d1 s + d2 s² at ``s`` (k,); a general polynomial takes longer."""
-    last = s * section[-1]
-    return np.asarray(1.0 + (last if len(section) == 2 else s * (section[1] + last)))
+    """Return 1 + d1 s + d2 s² at ``s`` = jω (k,); complex products take twice as long."""
+    found, omega = np.ones_like(s), s.imag
+    found.imag = omega * section[1]
+    if len(section) == 3:
+        found.real -= omega * (omega * section[2])
+    return found
 
 
 def _delayed(s: ComplexArray, delay: float) -> ComplexArray:

@@ -99,15 +99,16 @@ def descend(project: Project, start: Projection, box: Box, evaluations: int) -> 
             moved = False
         # A parameter at its bound whose step would leave the box is fixed.
         free = ~(((nonlinear <= lower) & (slope > 0)) | ((nonlinear >= upper) & (slope < 0)))
-        scale = np.sqrt(np.maximum(np.diag(curvature), 0.0))
+        scale = np.sqrt(np.maximum(curvature.diagonal(), 0.0))
         free &= scale > _INSENSITIVE * np.max(scale)
         if not np.any(free):
             break
         unit, step = scale[free], np.zeros_like(slope)
-        damped = curvature[np.ix_(free, free)] / np.outer(unit, unit) + damping * np.eye(len(unit))
+        damped = curvature[free][:, free] / np.multiply.outer(unit, unit)
+        damped.flat[:: len(unit) + 1] += damping
         step[free] = -np.linalg.solve(damped, slope[free] / unit) / unit
-        step = np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
-        tried = project(np.clip(nonlinear + step, lower, upper))
+        step = np.minimum(np.maximum(step, -_LONGEST_STEP), _LONGEST_STEP)
+        tried = project(np.minimum(np.maximum(nonlinear + step, lower), upper))
         new_cost = float(tried.residual @ tried.residual)
         if not new_cost < cost:
             way = np.abs(tried.nonlinear - nonlinear)

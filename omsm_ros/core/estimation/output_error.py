@@ -3,8 +3,8 @@
 The motion is closed to a period by a smooth bridge, and filtered by its spectrum,
 ``Y(jω) = G(jω) U(jω)``. This takes the motion between samples as band-limited, which is exact for
 any G and any delay as long as the motion has no content beyond half the sampling rate;
-:mod:`~omsm_ros.core.identification.covariance_terms` bounds the error where it has. Model and data
-are compared in time, so a missing sample is simply not compared. Gain, offset and drift enter
+:mod:`~omsm_ros.core.identification.response_uncertainty` bounds the error where it has. Model and
+data are compared in time, so a missing sample is simply not compared. Gain, offset and drift enter
 linearly and are eliminated (variable projection, Golub and Pereyra 1973, with Kaufman's
 simplification of the derivative).
 """
@@ -12,9 +12,10 @@ simplification of the derivative).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -114,6 +115,7 @@ class Problem:
     input_shared: float = 0.0
     errors_in_variables: FloatArray | None = None
     recorded: FloatArray | None = None
+    _last: list[Any] = field(default_factory=list, init=False)
 
     @property
     def recordings(self) -> list[slice]:
@@ -295,7 +297,11 @@ class Problem:
 
     def driven_spectrum(self, fitted: Fit) -> ComplexArray:
         """Return the spectrum of the output of ``fitted`` without background, at ``s``, (k,)."""
-        return self._through(fitted, self.drives(fitted.structure))
+        last = self._last  # it is often asked for again
+        if not last or last[0] is not fitted.nonlinear or last[1] is not fitted.driven:
+            through = self._through(fitted, self.drives(fitted.structure))
+            last[:] = fitted.nonlinear, fitted.driven, through
+        return np.asarray(last[2], np.complex128)
 
     def _through(self, fitted: Fit, drives: Sequence[tuple[ComplexArray, int]]) -> ComplexArray:
         ends = np.cumsum([count for _, count in drives])

@@ -19,7 +19,7 @@ from scipy import fft, ndimage, signal
 from omsm_ros.core.estimation.model_order import StartingPoints, fit
 from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.noise import plateau_variance, plateaus, reading_step
-from omsm_ros.core.estimation.output_error import Problem
+from omsm_ros.core.estimation.output_error import ENOUGH_SAMPLES, Problem
 from omsm_ros.core.estimation.parallel_sections import STATIONARY_S
 from omsm_ros.core.estimation.steps import (
     LEAST_SAMPLES,
@@ -29,6 +29,7 @@ from omsm_ros.core.estimation.steps import (
     check_usable,
     extended,
     find_steps,
+    moves,
     sample_noise,
 )
 from omsm_ros.core.lti.transfer_function import Structure
@@ -75,8 +76,7 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
     """
     check_usable(record)
     for axis, position in record.further.items():
-        noise, travel = sample_noise(position), float(np.ptp(position))
-        if travel <= max(NOISE_FACTOR * noise, 1e-12):
+        if not moves(position):
             # Noise of an encoder is no motion that the probe could follow.
             raise StepTestError("estimation.axis_at_rest", axis=axis)
     motion, axis_spikes = _bridged(_motion(record, source))
@@ -99,7 +99,9 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
         input_error=step**2 / 12,
         input_shared=plateau_variance(problem.input, plateau, step),
     )
-    return Prepared(problem, steps, spikes, axis_spikes)
+    prepared = Prepared(problem, steps, spikes, axis_spikes)
+    _check_axis_steps(prepared)
+    return prepared
 
 
 def _motion(record: MotionRecord, source: str) -> FloatArray:
@@ -176,12 +178,11 @@ def joined_recordings(records: Sequence[MotionRecord]) -> MotionRecord:
     """Return one record of several recordings of one machine, with rests between them.
 
     Each later one starts where the one before it ended, in Z and at the probe: it has an offset of
-    its own, and the rest is motion that nothing is compared at. Counts are added.
+    its own, and the rest is motion that nothing is compared at. Counts are added. A recording is
+    parted where the probe has no reading for longer than it has readings at all.
 
     Raises DataError for recordings of different sample periods, axes or sensors.
     """
-    if len(records) == 1:
-        return records[0]
     first = records[0]
     for number, record in enumerate(records[1:], start=2):
         if (
@@ -190,6 +191,9 @@ def joined_recordings(records: Sequence[MotionRecord]) -> MotionRecord:
             or (record.reference is None) != (first.reference is None)
         ):
             raise DataError("estimation.unlike_recordings", number=number)
+    records = [part for record in records for part in _parted(record)]
+    if len(records) == 1:
+        return records[0]
     motions = [
         faded_to_stationary(r.z, find_steps(r.z, r.sample_period).moving, r.sample_period)
         for r in records
@@ -215,6 +219,26 @@ def joined_recordings(records: Sequence[MotionRecord]) -> MotionRecord:
     )
 
 
+def _parted(record: MotionRecord) -> list[MotionRecord]:
+    """Return the parts of ``record`` between long stretches without a reading of the probe.
+
+    It would take most of the time of a fit. Before a part, modes decay. The first has all counts.
+    """
+    known = np.flatnonzero(record.ok)
+    least = max(len(known), ENOUGH_SAMPLES)
+    breaks = np.flatnonzero(np.diff(known, prepend=-1, append=len(record)) > least)
+    if len(record.starts) > 1 or len(breaks) == 0:
+        return [record]
+    rest, runs = round(STATIONARY_S / record.sample_period), np.split(known, breaks)
+    parts = [
+        record.part(max(int(run[0]) - rest, 0), int(run[-1]) + 1 + _EDGE_GUARD)
+        for run in runs
+        if len(run) >= LEAST_SAMPLES
+    ]
+    parts = [part for part in parts if moves(part.z)]
+    return [replace(p, counts={} if i else record.counts) for i, p in enumerate(parts)] or [record]
+
+
 def _chained(parts: Sequence[FloatArray], rest: int) -> FloatArray:
     """Return ``parts`` in a row, each from where the one before ended and held for ``rest``."""
     level, found = 0.0, list[FloatArray]()
@@ -237,11 +261,11 @@ def faded_to_stationary(motion: FloatArray, moving: BoolArray, period: float) ->
     rising = np.cumsum(signal.windows.kaiser(length, _FADE_SHAPE))
     rising = rising / rising[-1]
     carried = motion.copy()
-    for moves, end, weight in (
+    for fades, end, weight in (
         (moving[0], slice(0, length), rising),
         (moving[-1], slice(len(motion) - length, None), rising[::-1]),
     ):
-        if moves:
+        if fades:
             level = np.mean(motion[end])
             carried[end] = level + weight * (motion[end] - level)
     return carried
@@ -317,7 +341,7 @@ _SEEN = 0.25
 _UNEVEN = 0.3
 
 
-def check_axis_steps(prepared: Prepared) -> None:
+def _check_axis_steps(prepared: Prepared) -> None:
     """Raise IdentificationError where steps of the axis' positions hide the response.
 
     That is where their rounding error exceeds the noise of the probe, and where the residual of a

@@ -320,7 +320,7 @@ class SectionsProblem:
             noise = noise_before_fit(missed[used], followed, used, length)
             on_grid = np.zeros((len(basis), len(missed)))
             on_grid[:, used] = basis
-            score += weighted_gram(on_grid, length, noise)
+            score += weighted_gram(fft.rfft(on_grid, length), length, noise)
         turn = self._coefficient_jacobian(fitted, RATE / period) @ root
         found = turn @ score @ turn.T
         return np.asarray(0.5 * (found + found.T))

@@ -78,6 +78,11 @@ def sample_noise(values: FloatArray) -> float:
     return min((m / u for m, u in zip(middles, units, strict=True)), default=0.0)
 
 
+def moves(z: FloatArray) -> bool:
+    """Return whether ``z`` (n,) [m] travels farther than its noise."""
+    return float(np.ptp(z)) > max(NOISE_FACTOR * sample_noise(z), 1e-12)
+
+
 def find_steps(z: FloatArray, sample_period: float) -> Steps:
     """Return the edges of ``z`` (n,) [m] sampled every ``sample_period`` [s].
 

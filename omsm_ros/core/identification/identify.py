@@ -7,9 +7,8 @@ On a fixed target ``distance = offset + drift · t - static_gain · (G_m u)(t)``
 | prepare the record for a fit | :mod:`omsm_ros.core.estimation.preparation` |
 | choose and fit a model | :mod:`model_choice` |
 | model what the residual shows besides | :mod:`model_error_search` |
-| covariance from noise | :mod:`response_uncertainty` |
-| further terms of the covariance | :mod:`covariance_terms` |
-| checks | :mod:`checks`, :mod:`model_error_checks` |
+| covariance from noise, and its further terms | :mod:`response_uncertainty` |
+| checks | :mod:`checks` |
 | certificate and verdict | :func:`certificate_of` |
 
 The static gains are regressions on the plateaus. With a reference sensor on the same motion there
@@ -43,28 +42,23 @@ from omsm_ros.core.calibration.latency import unresolved_latency
 from omsm_ros.core.estimation.covariance import with_random_walk
 from omsm_ros.core.estimation.model_structure import Fit
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
-from omsm_ros.core.estimation.preparation import Prepared, check_axis_steps, check_gain, prepare
+from omsm_ros.core.estimation.preparation import Prepared, check_gain, joined_recordings, prepare
 from omsm_ros.core.estimation.steps import find_steps
-from omsm_ros.core.identification.checks import CHECKS, limits_of
-from omsm_ros.core.identification.covariance_terms import (
-    contrast_covariance,
-    inter_sample_delay_bound,
-    priors_of,
-    reference_lag,
-    undetected_covariance,
-)
-from omsm_ros.core.identification.evidence import IdentificationEvidence
+from omsm_ros.core.identification.checks import CHECKS, limits_of, model_errors_of
 from omsm_ros.core.identification.model_choice import ChosenModel, model_from_start
-from omsm_ros.core.identification.model_error_checks import model_errors_of
 from omsm_ros.core.identification.model_error_search import SearchResult, search_model_errors
 from omsm_ros.core.identification.response_uncertainty import (
+    IdentificationEvidence,
+    contrast_covariance,
     inflate_to_free_choice,
+    priors_of,
+    reference_lag,
     response_uncertainty,
+    undetected_covariance,
 )
 from omsm_ros.core.lti.frequency_response import ResponseLimits, low_frequency_delay_uncertainty
 from omsm_ros.core.lti.modes import (
     FITTED,
-    TwoMassFit,
     fit_two_mass,
     modal_remainder,
     mode_entries,
@@ -153,8 +147,8 @@ def identify(
     trusted is returned with the verdict "rejected" in its certificate.
     """
     mass, priors = table_mass(settings or {}), priors_of(settings or {})
+    record = joined_recordings([record])
     prepared = prepare(record, input)
-    check_axis_steps(prepared)
     progress(STEPS, steps=len(prepared.steps.edges))
     budget = budget or EvaluationBudget()
     budget.watch = lambda poles, done: progress(ORDER, order=poles, evaluations=done)
@@ -301,19 +295,16 @@ def _residual(evidence: IdentificationEvidence) -> Residual:
 
 
 def _response(evidence: IdentificationEvidence, table_mass: float | None) -> Response:
-    dynamics, known, prepared = evidence.dynamics, evidence.known, evidence.prepared
-    problem, reference = prepared.problem, evidence.reference
+    dynamics, known, reference = evidence.dynamics, evidence.known, evidence.reference
     return Response(
         low_frequency_delay_s=dynamics.low_frequency_delay,
         low_frequency_delay_uncertainty_s=low_frequency_delay_uncertainty(
             dynamics, known.covariance
         ),
-        inter_sample_delay_bound_s=inter_sample_delay_bound(
-            problem.input, prepared.steps, problem.period
-        ),
+        inter_sample_delay_bound_s=evidence.inter_sample_delay,
         reference_lag_s=None if reference is None else reference.value,
         reference_lag_uncertainty_s=None if reference is None else reference.uncertainty,
-        shape=response_features(dynamics, 0.5 / problem.period),
+        shape=response_features(dynamics, 0.5 / evidence.record.sample_period),
         modes=tuple(mode_entries(dynamics, known.covariance)),
         modal_remainder=modal_remainder(dynamics, known.valid_up_to),
         two_mass=two_mass_model(dynamics, known.covariance, known.valid_up_to, table_mass),
@@ -353,7 +344,8 @@ def two_mass_model(
             collocated=collocated,
             frequencies=lines,
         )
-        if _plausible(fitted):
+        known = bool(np.all(fitted.uncertainty < _GREATEST_UNCERTAINTY))
+        if known and fitted.misfit < _GREATEST_MISFIT:
             return TwoMassModel(
                 table_mass_kg=mass,
                 model=asdict(fitted.model),
@@ -362,11 +354,6 @@ def two_mass_model(
                 collocated=collocated,
             )
     return None
-
-
-def _plausible(fitted: TwoMassFit) -> bool:
-    known = bool(np.all(fitted.uncertainty < _GREATEST_UNCERTAINTY))
-    return fitted.misfit < _GREATEST_MISFIT and known
 
 
 # Rest after an edge that is not averaged, for the response to settle.

@@ -198,14 +198,6 @@ class TwoMass:
             m1 * m2,
         ]
 
-    def non_collocated(self) -> TransferFunction:
-        """Return the motion of m2 (Eq. 7), scaled to G(0) = 1."""
-        return TransferFunction.from_ascending(*self.polynomials(collocated=False)).normalised()
-
-    def collocated(self) -> TransferFunction:
-        """Return the motion of the driven mass m1, scaled to G(0) = 1."""
-        return TransferFunction.from_ascending(*self.polynomials(collocated=True)).normalised()
-
 
 @dataclass(frozen=True, eq=False)
 class TwoMassFit:
@@ -242,7 +234,7 @@ def fit_two_mass(
     if len(oscillating) < 2:
         raise IdentificationError("lti.few_modes", modes=len(oscillating))
     target = np.log(dynamics.response(lines))
-    s = 2j * np.pi * lines
+    powers = (2j * np.pi * lines) ** np.arange(5)[:, np.newaxis]
     jacobian = relative_response_jacobian(dynamics, lines).reshape(2 * len(lines), -1)
     whiten = _whitener(jacobian, covariance)
 
@@ -252,7 +244,7 @@ def fit_two_mass(
     def polynomials(logs: FloatArray) -> list[tuple[ComplexArray, float]]:
         # A transfer function, which checks its coefficients, would take three times as long.
         each = model(logs).polynomials(collocated=collocated)
-        return [(polynomial.polyval(s, one), one[0]) for one in each]
+        return [(one @ powers[: len(one)], one[0]) for one in each]
 
     def residual(logs: FloatArray) -> FloatArray:
         (up, up_0), (down, down_0) = polynomials(logs)

@@ -301,16 +301,15 @@ class ModelErrorFamilies:
         ]
 
         def part(first: int, last: int) -> FloatArray:
-            return np.concatenate([self.mode(*each).T for each in found[first:last]]).T
+            spectra = np.empty((last - first, 2, len(self._answer)), np.complex128)
+            for rows, (frequency, damping) in zip(spectra, found[first:last], strict=True):
+                s = self.problem.s * (self.problem.rate / (2 * np.pi * frequency))
+                mode = self._answer / (1 + 2 * damping * s + s * s)
+                rows[:] = mode - self._answer, s * mode
+            return self._in_time(spectra.reshape(-1, len(self._answer)))
 
         frequencies, dampings = np.array(found).T
         return ModelErrorFamily(MODE, frequencies, len(found) / 2, part, 2, dampings)
-
-    def mode(self, frequency: float, damping: float) -> FloatArray:
-        """Return the columns (n, 2) of the mode at ``frequency`` [Hz], as in :meth:`modes`."""
-        s = self.problem.s * (self.problem.rate / (2 * np.pi * frequency))
-        mode = self._answer / (1 + 2 * damping * s + s * s)
-        return self._in_time(np.array([mode - self._answer, s * mode]))
 
     def vibration(self) -> ModelErrorFamily:
         """Return the sine and cosine at the strongest lines of the residual."""

@@ -13,9 +13,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from math import inf, log
 
 import numpy as np
-from scipy import fft, stats
+from scipy import fft, special
 
 from omsm_ros.core.calibration.certificate import PartsCompared
 from omsm_ros.core.estimation.covariance import noise_spectrum, weighted_gram
@@ -24,6 +25,7 @@ from omsm_ros.core.estimation.model_structure import Fit
 from omsm_ros.core.estimation.noise import RandomWalk, scatter_in_time, uneven_rows, with_walk
 from omsm_ros.core.estimation.output_error import ENOUGH_SAMPLES, Problem
 from omsm_ros.core.estimation.steps import Edge, Steps, segments
+from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.model_errors.families import (
     BACKLASH,
     CREEP,
@@ -67,7 +69,8 @@ class Score:
     @property
     def log_p(self) -> float:
         """Return ln of the probability of ``chi_square`` or more if the term is absent."""
-        return float(stats.chi2.logsf(self.chi_square, self.degrees)) if self.degrees else 0.0
+        p = float(special.chdtrc(self.degrees, self.chi_square)) if self.degrees else 1.0
+        return log(p) if p > 0 else -inf
 
     @property
     def uncertainty(self) -> float:
@@ -157,6 +160,12 @@ class ResidualSpace:
     def _residual(self) -> FloatArray:
         return self.problem.on_grid(self.fitted.residual, 0.0)
 
+    @cached_property
+    def _spectra(self) -> list[ComplexArray]:
+        """The transform of the residual of each recording."""
+        parts = [self._residual[part] for part in self.problem.recordings]
+        return [fft.rfft(part, fft.next_fast_len(len(part), real=True)) for part in parts]
+
     def _noise_of(self, rows: FloatArray, found: FloatArray, walk: float) -> FloatArray:
         """Return the covariance (c, c) of noise times ``rows`` (c, n).
 
@@ -166,13 +175,14 @@ class ResidualSpace:
         """
         used, even = self.problem.used, np.zeros((len(rows), len(rows)))
         missed = self._residual - found @ rows
-        for part in self.problem.recordings:
-            # Each recording has noise of its own.
-            samples, places = part.stop - part.start, np.flatnonzero(used[part])
-            length = fft.next_fast_len(samples, real=True)
-            noise = smoothed_noise_spectrum(missed[part][places], places, samples, length)
+        # Each recording has noise of its own.
+        for part, before in zip(self.problem.recordings, self._spectra, strict=True):
+            length = fft.next_fast_len(part.stop - part.start, real=True)
+            spectra = fft.rfft(rows[:, part], length)
+            own = missed[part][used[part]]
+            noise = smooth_noise_spectrum(own, before - found @ spectra, length)
             noise *= self.fitted.samples / max(self.fitted.samples - self.fitted.size, 1)
-            even += weighted_gram(rows[:, part], length, with_walk(noise, walk, length))
+            even += weighted_gram(spectra, length, with_walk(noise, walk, length))
         if self._scatter == 0 and self.problem.shared == self.problem.input_error == 0:
             return even
         uneven = uneven_rows(self.problem, rows[:, used].T, self._scatter)
@@ -194,19 +204,15 @@ def _lengths(rows: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.einsum("cn,cn->c", rows, rows)))
 
 
-def smoothed_noise_spectrum(
-    residual: FloatArray, place: IntArray, samples: int, length: int
-) -> FloatArray:
+def smooth_noise_spectrum(residual: FloatArray, spectrum: ComplexArray, length: int) -> FloatArray:
     """Return the variance spectrum of ``residual`` (k,) at ``length`` // 2 + 1 frequencies.
 
-    place: index of each among ``samples``
+    spectrum: transform of it, 0 where nothing is compared, filled to ``length``
 
     It is the larger of an autoregressive spectrum, which misses slow drift, and of the periodogram
     smoothed over an octave, which does not.
     """
-    on_grid = np.zeros(samples)
-    on_grid[place] = residual
-    power = np.abs(fft.rfft(on_grid, length)) ** 2 / len(residual)
+    power = (spectrum.real**2 + spectrum.imag**2) / len(residual)
     low, high = _octaves(len(power))
     total = np.concatenate([[0.0], np.cumsum(power)])
     smooth = (total[high] - total[low]) / np.maximum(high - low, 1)
@@ -362,14 +368,11 @@ class ResidualDiagnostics:
         rate = np.concatenate([np.zeros(LAGS - 1), np.gradient(self.problem.motion)])
         # The last values of the rate, the newest last, 0 before the record.
         past = np.lib.stride_tricks.sliding_window_view(rate, len(rate) - LAGS + 1)
-        parts = [slice(i, i + BLOCK_ROWS) for i in range(0, past.shape[1], BLOCK_ROWS)]
-        rows = (np.ascontiguousarray(past[:, part]) for part in parts)
-        mixed = inverse_root(np.sum([each @ each.T for each in rows], axis=0)).T
+        parts = (past[:, i : i + BLOCK_ROWS].copy() for i in range(0, past.shape[1], BLOCK_ROWS))
+        mixed = inverse_root(np.sum([each @ each.T for each in parts], axis=0)).T
         if not mixed.size:
             return 1.0
-        columns = np.empty((len(mixed), past.shape[1]))
-        for part in parts:
-            columns[:, part] = mixed @ np.ascontiguousarray(past[:, part])
+        columns = np.array([np.correlate(rate, row, "valid") for row in mixed])
         return float(np.exp(self.space.judged(columns).log_p))
 
     def significant(self, but: Collection[str] = ()) -> list[ScoreTest]:

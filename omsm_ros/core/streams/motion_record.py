@@ -84,6 +84,20 @@ class MotionRecord:
     def __len__(self) -> int:
         return len(self.z)
 
+    def part(self, start: int, stop: int) -> MotionRecord:
+        """Return the samples from ``start`` to before ``stop``, as one recording."""
+        part = slice(start, stop)
+        return replace(
+            self,
+            z=self.z[part],
+            further={name: position[part] for name, position in self.further.items()},
+            distance=self.distance[part],
+            ok=self.ok[part],
+            reference=None if self.reference is None else self.reference[part],
+            z_lost=None if self.z_lost is None else self.z_lost[part],
+            starts=(0,),
+        )
+
 
 def assemble(
     axes: Sequence[AxisBlock],
@@ -301,16 +315,8 @@ def _covered(record: MotionRecord) -> MotionRecord:
     places = np.flatnonzero(known)
     if not len(places):
         raise DataError("streams.no_common_time")
-    part = slice(int(places[0]), int(places[-1]) + 1)
-    return replace(
-        record,
-        z=record.z[part],
-        further={name: position[part] for name, position in record.further.items()},
-        distance=record.distance[part],
-        ok=record.ok[part],
-        reference=None if record.reference is None else record.reference[part],
-        z_lost=None if np.all(known[part]) else ~known[part],
-    )
+    part = record.part(int(places[0]), int(places[-1]) + 1)
+    return replace(part, z_lost=None) if np.all(known[places[0] : places[-1]]) else part
 
 
 # A block needs 2 kB besides its samples, which is much for a short block: that many blocks are

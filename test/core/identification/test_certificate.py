@@ -19,11 +19,13 @@ from omsm_ros.core.calibration.certificate import (
 )
 from omsm_ros.core.calibration.intended_use import PAPER_USE
 from omsm_ros.core.estimation.preparation import prepare
-from omsm_ros.core.identification.evidence import IdentificationEvidence
 from omsm_ros.core.identification.identify import certificate_of
 from omsm_ros.core.identification.model_choice import choose_model
 from omsm_ros.core.identification.model_error_search import SearchResult
-from omsm_ros.core.identification.response_uncertainty import response_uncertainty
+from omsm_ros.core.identification.response_uncertainty import (
+    IdentificationEvidence,
+    response_uncertainty,
+)
 from omsm_ros.core.lti.frequency_response import ResponseLimits
 from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
 from omsm_ros.core.streams.motion_record import assemble

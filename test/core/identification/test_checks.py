@@ -56,7 +56,7 @@ def evidence(
     residual = {"chi_square": 1.0, "noise": noises[1], "timing": 0.0, "axis_timing": 0.0}
     residual |= {name: known.pop(name) for name in residual if name in known}
     dynamics, covariance = lag
-    problem = SimpleNamespace(period=period, input=bound, errors_in_variables=None)
+    problem = SimpleNamespace(period=period, errors_in_variables=None)
     return SimpleNamespace(
         prepared=SimpleNamespace(
             problem=problem, axis_spikes=0, steps=SimpleNamespace(noise=noises[0])
@@ -76,6 +76,7 @@ def evidence(
         fit=SimpleNamespace(gain=gain, uncertain=uncertain, structure=SimpleNamespace(poles=2)),
         dynamics=dynamics,
         lag_in_residual=(0.0, 0.0),
+        inter_sample_delay=bound,
         limits=LIMITS,
         use=use,
         reached=reached,
@@ -86,7 +87,6 @@ def evidence(
 def computed(monkeypatch):
     """Stated numbers stand for those computed from a fit."""
     monkeypatch.setattr(checks, "gain_uncertainty_alone", lambda problem, fit: fit.uncertain)
-    monkeypatch.setattr(checks, "inter_sample_delay_bound", lambda bound, steps, period: bound)
     monkeypatch.setattr(checks, "accuracy_on", lambda stated: stated.reached)
 
 

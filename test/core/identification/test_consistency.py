@@ -12,8 +12,8 @@ from omsm_ros.core.estimation.model_order import fit
 from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.checks import consistency
-from omsm_ros.core.identification.covariance_terms import contrast_covariance
 from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.identification.response_uncertainty import contrast_covariance
 from omsm_ros.core.kinematics.trajectories import StepPlan
 from omsm_ros.core.lti.frequency_response import low_frequency_delay_uncertainty
 from omsm_ros.core.lti.transfer_function import Structure

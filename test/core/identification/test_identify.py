@@ -9,6 +9,7 @@ from scipy import stats
 from soaked import soaked
 
 from benchmarks.identification import record_once
+from benchmarks.recorded import two_mass_response
 from benchmarks.step_test import StepTest
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import REJECTED, Certificate
@@ -168,7 +169,7 @@ class TestOtherPlants:
 
     @pytest.mark.parametrize("collocated", [True, *soaked(False)])
     def test_two_masses(self, collocated):
-        truth = TWO_MASS.collocated() if collocated else TWO_MASS.non_collocated()
+        truth = two_mass_response(TWO_MASS, collocated=collocated)
         calibration = self.band_holds(truth, np.array([1.0, 15.0, 50.0]))
         found = [m.frequency for m in known_modes(calibration.dynamics)][:2]
         expected = [m.frequency for m in known_modes(truth)]

@@ -11,7 +11,7 @@ import pytest
 from benchmarks.step_test import StepTest
 from benchmarks.twin_motions import respond
 from omsm_ros.core.estimation.steps import find_steps
-from omsm_ros.core.identification.covariance_terms import inter_sample_delay_bound
+from omsm_ros.core.identification.response_uncertainty import inter_sample_delay_bound
 from omsm_ros.core.kinematics.trajectories import Chirp
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.surface.nominal import Flat

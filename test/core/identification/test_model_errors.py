@@ -14,11 +14,14 @@ from omsm_ros.core.calibration.certificate import REJECTS
 from omsm_ros.core.estimation.model_order import fit
 from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.estimation.preparation import prepare
-from omsm_ros.core.identification.checks import agreement, dynamic_gain, independence
-from omsm_ros.core.identification.covariance_terms import reference_lag
+from omsm_ros.core.identification.checks import (
+    agreement,
+    dynamic_gain,
+    independence,
+    model_errors_of,
+)
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
-from omsm_ros.core.identification.model_error_checks import model_errors_of
 from omsm_ros.core.identification.model_error_search import (
     SearchResult,
     _select_nuisance_terms,
@@ -26,6 +29,7 @@ from omsm_ros.core.identification.model_error_search import (
     search_model_errors,
 )
 from omsm_ros.core.identification.residual_tests import response_difference
+from omsm_ros.core.identification.response_uncertainty import reference_lag
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.core.model_errors.families import (

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from soaked import soaked
 
+from benchmarks.recorded import two_mass_response
 from benchmarks.step_test import StepTest
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.lti.frequency_response import response_band
@@ -59,7 +60,10 @@ def test_noise_of_the_encoder_that_rings_at_the_mode_counts():
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("truth", [MACHINE.non_collocated(), MACHINE.collocated()])
+@pytest.mark.parametrize(
+    "truth",
+    [two_mass_response(MACHINE, collocated=False), two_mass_response(MACHINE, collocated=True)],
+)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_either_mode_of_two_masses(truth, seed):
     found = identified(truth, seed)
@@ -91,7 +95,7 @@ def test_the_pole_pair_of_eq_12_at_10_khz():
     [
         (TransferFunction.from_ascending([1.0], [1.0, 3e-3]), 3),
         (LONE, 1),
-        (MACHINE.non_collocated(), 2),
+        (two_mass_response(MACHINE, collocated=False), 2),
         (EQ_12, 1),
     ],
 )
@@ -120,7 +124,9 @@ def test_masses_and_springs_scatter_as_stated():
     """The whole chain, from the recording; m1 is the unit."""
     over = []
     for seed in range(1, 9):
-        entry = identified(MACHINE.non_collocated(), seed).certificate.response.two_mass
+        entry = identified(
+            two_mass_response(MACHINE, collocated=False), seed
+        ).certificate.response.two_mass
         model, stated = entry.model, entry.relative_uncertainty
         over.append(
             [np.log(model[n] * MACHINE.m1 / getattr(MACHINE, n)) / stated[n] for n in FITTED]

@@ -126,3 +126,22 @@ def test_recordings_of_other_rates_are_refused():
     first = alone(recording(0))
     with pytest.raises(DataError, match="recording 2"):
         joined_recordings([first, replace(first, sample_period=2e-3)])
+
+
+def test_a_long_stretch_out_of_range_parts_a_recording():
+    """Nothing compared is lost, and motion and readings keep their relation within each part."""
+    first, second = (alone(recording(seed)) for seed in range(2))
+    z = np.concatenate([first.z, np.full(50_000, first.z[-1]), first.z[-1] + second.z])
+    unread = np.full(50_000, np.nan)
+    whole = record_from_arrays(PERIOD, z, np.concatenate([first.distance, unread, second.distance]))
+    whole = replace(whole, counts={"out of range": 50_000})
+    found = joined_recordings([whole])
+    assert len(found) < len(first) + len(second) + 2500
+    assert found.counts == whole.counts
+    for part, start in zip((first, second), (0, len(found) - len(second)), strict=True):
+        place = slice(start, start + len(part))
+        assert np.all(found.ok[place] == part.ok)
+        assert np.allclose(np.diff(found.z[place]), np.diff(part.z), atol=1e-18)
+        assert np.allclose(np.diff(found.distance[place]), np.diff(part.distance), atol=1e-15)
+    short = replace(whole, ok=whole.ok | (np.arange(len(whole)) % 100 == 0))
+    assert joined_recordings([short]) is short

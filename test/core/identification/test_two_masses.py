@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 from soaked import soaked
 
+from benchmarks.recorded import two_mass_response
 from benchmarks.step_test import StepTest
 from omsm_ros.core.identification.identify import identify, table_mass, two_mass_model
 from omsm_ros.core.lti.modes import FITTED, TwoMass, fit_two_mass
@@ -23,7 +24,7 @@ MACHINE = TwoMass(m1=10.0, m2=2.0, k1=2e6, k2=4e5, c1=450.0, c2=60.0)
 
 @lru_cache(maxsize=4)
 def calibrated(collocated, mass):
-    dynamics = MACHINE.collocated() if collocated else MACHINE.non_collocated()
+    dynamics = two_mass_response(MACHINE, collocated=collocated)
     recording = record(Cell(plant=Plant(dynamics)), StepTest(), Flat(), stand_off=-49e-6)
     settings = {} if mass is None else {"table_mass_kg": mass}
     return identify(assemble([recording.axes], [recording.distance]), settings=settings).calibration
@@ -71,7 +72,7 @@ def test_without_a_mass_all_is_per_mass_of_the_table(collocated):
 
 def test_what_is_not_two_masses_is_not_called_so():
     """Eq. 7 of a second mass has no zeros on the imaginary axis; a driven first mass has."""
-    chain = MACHINE.non_collocated()
+    chain = two_mass_response(MACHINE, collocated=False)
     anti_resonance = [1.0, 0.0, (2 * np.pi * 20.0) ** -2]
     odd = TransferFunction(np.array(anti_resonance), chain.denominator)
     covariance = np.diag([0.0, *(1e-3 * np.abs([1e-4, odd.numerator[2], *chain.denominator[1:]]))])
@@ -86,7 +87,7 @@ def test_one_mode_is_no_pair_of_masses():
 
 @pytest.mark.soak
 def test_masses_do_not_explain_a_latency():
-    chain = MACHINE.non_collocated()
+    chain = two_mass_response(MACHINE, collocated=False)
     late = TransferFunction(chain.numerator, chain.denominator, 5e-4)
     recording = record(Cell(plant=Plant(late)), StepTest(), Flat(), stand_off=-49e-6)
     found = identify(assemble([recording.axes], [recording.distance])).calibration
@@ -98,7 +99,7 @@ def test_masses_do_not_explain_a_latency():
 def test_stated_uncertainty_and_misfit_are_those_of_repeated_fits():
     found = calibrated(False, 10.0)
     lines = np.linspace(found.valid_up_to / 40, found.valid_up_to, 40)
-    centre = MACHINE.non_collocated()
+    centre = two_mass_response(MACHINE, collocated=False)
     # The structure that was identified has more zeros than the truth; they are zero there.
     numerator = np.zeros(len(found.dynamics.numerator))
     numerator[: len(centre.numerator)] = centre.numerator

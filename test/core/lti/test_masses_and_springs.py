@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from benchmarks.recorded import two_mass_response
 from omsm_ros.core.lti.frequency_response import relative_response_jacobian
 from omsm_ros.core.lti.modes import (
     FITTED,
@@ -39,13 +40,13 @@ def test_eq_7_follows_from_the_equations_of_motion(mass):
     direct = np.array(
         [(row @ np.linalg.solve(2j * np.pi * f * np.eye(4) - a, b))[0, 0] for f in frequency]
     )
-    ours = MACHINE.non_collocated() if mass else MACHINE.collocated()
+    ours = two_mass_response(MACHINE, collocated=not mass)
     np.testing.assert_allclose(ours.response(frequency), direct * MACHINE.k1, rtol=1e-8)
 
 
 def test_a1_as_printed_would_make_an_ordinary_machine_unstable():
-    assert MACHINE.non_collocated().is_stable
-    printed = MACHINE.non_collocated().denominator.copy()
+    assert two_mass_response(MACHINE, collocated=False).is_stable
+    printed = two_mass_response(MACHINE, collocated=False).denominator.copy()
     printed[1] = (MACHINE.k1 + MACHINE.k2) * MACHINE.c1 / (MACHINE.k1 * MACHINE.k2)
     assert not TransferFunction([1.0], printed).is_stable
 
@@ -57,7 +58,7 @@ def test_a_mass_must_be_positive(value):
 
 
 def test_only_conjugate_pairs_oscillate():
-    dynamics = MACHINE.non_collocated()
+    dynamics = two_mass_response(MACHINE, collocated=False)
     slow = np.polynomial.polynomial.polymul(dynamics.denominator, [1.0, 0.1])
     damped = TransferFunction(dynamics.numerator, slow)
     assert oscillations(damped) == pytest.approx([m.frequency for m in known_modes(dynamics)])
@@ -65,7 +66,7 @@ def test_only_conjugate_pairs_oscillate():
 
 @pytest.mark.parametrize("collocated", [False, True])
 def test_masses_and_springs_are_recovered(collocated):
-    truth = MACHINE.collocated() if collocated else MACHINE.non_collocated()
+    truth = two_mass_response(MACHINE, collocated=collocated)
     size = len(truth.numerator) + len(truth.denominator)
     covariance = np.zeros((size, size))
     covariance[len(truth.numerator), len(truth.numerator)] = (1e-4 * truth.denominator[1]) ** 2
@@ -86,7 +87,7 @@ def test_masses_and_springs_are_recovered(collocated):
 def test_masses_and_springs_lie_within_what_is_stated_of_them(collocated):
     """Responses drawn from their covariance, with coefficients that the machine does not need."""
     soft = TwoMass(m1=1.0, m2=0.2, k1=2e5, k2=4e4, c1=45.0, c2=6.0)
-    truth = soft.collocated() if collocated else soft.non_collocated()
+    truth = two_mass_response(soft, collocated=collocated)
     numerator = np.zeros(4)
     numerator[: len(truth.numerator)] = truth.numerator
     lines = np.linspace(2, 80, 40)
@@ -149,15 +150,15 @@ def test_below_nyquist_eq_12_has_no_resonance():
 def test_the_dip_of_a_driven_mass_is_where_the_other_absorbs():
     """However far the gain falls beyond the modes."""
     light = TwoMass(m1=10.0, m2=2.0, k1=8e6, k2=1.6e6, c1=900.0, c2=6.0)
-    read = response_features(light.collocated(), 500.0)
+    read = response_features(two_mass_response(light, collocated=True), 500.0)
     assert read["minimum"] == pytest.approx(np.sqrt(light.k2 / light.m2) / (2 * np.pi), rel=2e-3)
-    modes = known_modes(light.collocated())
+    modes = known_modes(two_mass_response(light, collocated=True))
     assert read["resonance"] == pytest.approx(modes[0].frequency, rel=0.01)
 
 
 def test_a_covariance_that_rounding_made_indefinite_is_read_all_the_same():
     """Coefficients far apart in size: the least eigenvalue is rounding of the largest."""
-    truth = MACHINE.collocated()
+    truth = two_mass_response(MACHINE, collocated=True)
     size = len(truth.numerator) + len(truth.denominator)
     values = np.concatenate([truth.numerator, truth.denominator[1:], [1e-6]])
     covariance = 1e-8 * np.outer(values, values)

@@ -97,7 +97,7 @@ class TestModes:
     def test_a_mode_and_its_velocity_are_their_differential_equation(
         self, model_errors, answer, frequency, damping
     ):
-        model_error, velocity = model_errors.mode(frequency, damping).T
+        model_error, velocity = model_errors.modes([(frequency, damping)]).part(0, 1).T
         omega, period = 2 * np.pi * frequency, model_errors.problem.period
         bottom = [omega**-2, 2 * damping / omega, 1.0]
         moved = through([1.0], bottom, answer, period)
@@ -119,7 +119,7 @@ class TestModes:
             assert lines[-1] <= 100.0
         for index in (0, len(family.parameters) - 1):
             term = family.term(index)
-            alone = model_errors.mode(term.parameter, term.damping)
+            alone = model_errors.modes([(term.parameter, term.damping)]).part(0, 1)
             np.testing.assert_allclose(term.columns, alone, atol=1e-18)
 
 

@@ -42,7 +42,7 @@ def with_a_pole(clean):
 class TestOmitted:
     @pytest.mark.parametrize("frequency", [2.0, 9.0])
     def test_it_is_what_fitting_anew_with_the_term_in_the_data_gives(self, clean, frequency):
-        mode = clean.model_errors.mode(frequency, 0.1)[:, 0]
+        mode = clean.model_errors.modes([(frequency, 0.1)]).part(0, 1)[:, 0]
         size = 1e-4
         anew = fitted_anew(clean, Structure(0, 0, True), [clean.fitted.nonlinear], size * mode)
         found = coefficients(anew) - coefficients(clean.fitted)
@@ -51,7 +51,7 @@ class TestOmitted:
         assert abs(expected[-1]) > 1e-9
 
     def test_with_a_pole_too(self, with_a_pole):
-        mode = with_a_pole.model_errors.mode(6.0, 0.1)[:, 0]
+        mode = with_a_pole.model_errors.modes([(6.0, 0.1)]).part(0, 1)[:, 0]
         size = 1e-5
         start = [with_a_pole.fitted.nonlinear]
         before, after = (
@@ -71,7 +71,7 @@ class TestOmitted:
         assert shift[-1] == pytest.approx(1.0, rel=0.01)
 
     def test_it_is_linear(self, clean):
-        one, other = clean.model_errors.mode(5.0, 0.1).T
+        one, other = clean.model_errors.modes([(5.0, 0.1)]).part(0, 1).T
         np.testing.assert_allclose(
             omission_shift(clean, 2 * one - other),
             2 * omission_shift(clean, one) - omission_shift(clean, other),

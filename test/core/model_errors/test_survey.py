@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.recorded import record_from_arrays
-from omsm_ros.core.identification.covariance_terms import reference_lag
+from omsm_ros.core.identification.response_uncertainty import reference_lag
 from omsm_ros.core.model_errors.families import (
     BACKLASH,
     CREEP,
