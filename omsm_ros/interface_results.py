@@ -13,7 +13,6 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -315,9 +314,9 @@ class Adjusted(Result):
             yield "", text
 
     def _figure(self) -> Figure:
-        from omsm_ros.report.adjustment import form_map
+        from omsm_ros.report.adjustment import height_map
 
-        return form_map(SimpleNamespace(form=self))  # type: ignore[arg-type]
+        return height_map(self.x, self.y, self.height, "form deviation")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from omsm_ros.core.adjustment import Adjustment
 from omsm_ros.core.adjustment.sources import WITH_CALIBRATION
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.readable import NOTHING, count, expanded, measured, plain, quantity
 from omsm_ros.report import style
 from omsm_ros.report.page_parts import Section, fill_study, title_block
@@ -31,9 +32,10 @@ def render(title: str, facts: Mapping[str, Any], found: Adjustment, date: str) -
     facts: the content of ``adjustment.json``;  found: from which it was made;  date: as printed
     """
     origin, verdict = facts.get("origin") or {}, page_verdict(facts["verdict"])
+    place = (form := found.form).x, form.y
     figures = {
-        "map": form_map(found),
-        "uncertainty": uncertainty_map(found),
+        "map": height_map(*place, form.height, "form deviation"),
+        "uncertainty": height_map(*place, form.uncertainty, "standard uncertainty", "viridis"),
         "profiles": profiles(found),
     }
     if found.agreement:
@@ -137,32 +139,21 @@ def _scans(facts: Mapping[str, Any]) -> Table:
     return Table("", ("recording", "motion", "largest E_n"), rows)
 
 
-def form_map(found: Adjustment) -> Figure:
-    """Draw the form deviation, colours symmetric about zero."""
-    values = found.form.height / NANOMETRE_M
-    largest = float(np.max(np.abs(values)))
-    return _map(found, values, style.MAP_COLOURS, (-largest, largest), "form deviation [nm]")
-
-
-def uncertainty_map(found: Adjustment) -> Figure:
-    """Draw the standard uncertainty of the form deviation."""
-    values = found.form.uncertainty / NANOMETRE_M
-    return _map(found, values, "viridis", (0.0, float(np.max(values))), "standard uncertainty [nm]")
-
-
-def _map(
-    found: Adjustment, values: Any, colours: str, limits: tuple[float, float], name: str
+def height_map(
+    x: FloatArray, y: FloatArray, heights: FloatArray, name: str, colours: str = style.MAP_COLOURS
 ) -> Figure:
-    made, (ax,) = style.figure(6.1, 5.0)
+    """Draw heights at x, y (n,) [m], colours symmetric about zero if some are below it."""
+    values, (made, (ax,)) = heights / NANOMETRE_M, style.figure(6.1, 5.0)
+    high = float(np.max(np.abs(values)))
     drawn = ax.tripcolor(
-        found.form.x / MILLIMETRE_M, found.form.y / MILLIMETRE_M, values,
-        cmap=colours, vmin=limits[0], vmax=limits[1], shading="gouraud",
+        x / MILLIMETRE_M, y / MILLIMETRE_M, values, cmap=colours,
+        vmin=-high if np.min(values) < 0 else 0.0, vmax=high, shading="gouraud",
     )  # fmt: skip
     ax.set_aspect("equal")
     bar = made.colorbar(drawn, ax=ax)
     style.quiet(bar.ax)
-    style.label(bar.ax, y=name)
-    style.label(ax, x="x [mm]", y="y [mm]", title=name.split(" [")[0])
+    style.label(bar.ax, y=f"{name} [nm]")
+    style.label(ax, x="x [mm]", y="y [mm]", title=name)
     return made
 
 

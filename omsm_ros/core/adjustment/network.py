@@ -283,9 +283,8 @@ class Network:
         for knots, step in zip(self.knots, self.steps, strict=True):
             # Knots stand behind all others, and always take part.
             here = slice(knots.start - left_out, knots.stop - left_out)
-            matrix[here, here] += walk_precision(knots.stop - knots.start) / (
-                max(scales.walk, LEAST_VARIANCE) * step
-            )
+            moves = np.diff(np.eye(knots.stop - knots.start), axis=0)
+            matrix[here, here] += moves.T @ moves / (max(scales.walk, LEAST_VARIANCE) * step)
             level = _FIRST_LEVEL_M if knots is self.knots[0] else _LEVEL_M
             matrix[here.start, here.start] += level**-2
 
@@ -301,12 +300,6 @@ def _terms_at(part: PartModel, blocks: Blocks) -> FloatArray:
 
 # Square of a picometre: keeps what is exactly known regular.
 LEAST_VARIANCE, _LEAST_SIZE = 1e-24, 1e-15
-
-
-def walk_precision(number: int) -> FloatArray:
-    """Return DᵀD of first differences between ``number`` knots."""
-    difference = np.diff(np.eye(number), axis=0)
-    return np.asarray(difference.T @ difference)
 
 
 def _hats_of(

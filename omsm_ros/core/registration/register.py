@@ -125,6 +125,8 @@ def _bounded_step(
 # Points at a time: 49 columns of them are 6 MB.
 CHUNK = 16_384
 _MOST_SELECTED, _MOST_OF_BASIS, _MOST_REFINED = 40_000, 10_000, 30
+# Tracks of a scan that covers an area; the next one lies within this many distances of tracks.
+_FEWEST_TRACKS, _NEXT_TRACK = 4, 1.5
 # Points without errors, for seven unknowns.
 _ENOUGH_FOR_A_CURVE = 2000
 # A pose has converged too when its last step is below this share of its uncertainty: where form
@@ -169,9 +171,7 @@ def register(
     at = coarse_placement(surface, chosen, dofs.fitted, aperture, at)
     points = inside_aperture(placed(surface, at, chosen), aperture)
     disc = aperture.disc if aperture else disc_of(points.x, points.y)
-    x, y = (v[:: -(-len(v) // _MOST_OF_BASIS)] for v in (points.x, points.y))
-    area = area_weights(x, y, even=even, outline=aperture or disc)
-    basis = FormBasis.over(x, y, area, disc)
+    basis = FormBasis.over(*_measured_area(points.x, points.y, aperture or disc, even), disc)
     fit = _PoseFit(surface, dofs, aperture, basis, at)
     stand = fit.refine(at, chosen)
     open_ = OpenUncertainty(fit.unknown(stand.at, chosen))
@@ -182,6 +182,25 @@ def register(
         disc = disc_of(points.x, points.y)
     found = _over_all(fit, stand, near, sources, open_, dust, disc)
     return replace(found, placement=found.placement.moved(("x", "y"), vertex))
+
+
+def _measured_area(x: FloatArray, y: FloatArray, outline: Aperture, even: bool) -> FloatArray:
+    """Return places x, y [m] and areas whose sums are integrals over what points cover (3, k).
+
+    Where points x, y (n,) [m] cover the ``outline``, these are its nodes: areas of single points
+    are not exact, so that coma would have a tilt.
+    """
+    from scipy.spatial import cKDTree  # takes long to load
+
+    nodes, step = outline.nodes(), float(np.median(np.hypot(np.diff(x), np.diff(y))))
+    whole, path = float(np.sum(nodes[2])), step * len(x)  # a jump to the next line is no part of it
+    track = max(float(np.sqrt(whole / len(x))), whole / (path or np.inf))
+    if whole and min(np.ptp(x), np.ptp(y)) > _FEWEST_TRACKS * track:
+        away, _ = cKDTree(np.column_stack([x, y])).query(nodes[:2].T)
+        if np.max(away) < _NEXT_TRACK * track:
+            return nodes
+    x, y = (v[:: -(-len(v) // _MOST_OF_BASIS)] for v in (x, y))
+    return np.stack([x, y, area_weights(x, y, even=even, outline=outline)])
 
 
 def _about(vertex: FloatArray, portion: PointBatch) -> PointBatch:

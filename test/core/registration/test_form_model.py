@@ -10,7 +10,7 @@ from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.core.registration.register import register
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.aspheres import Sphere
-from omsm_ros.core.surface.nominal import ZernikeSurface
+from omsm_ros.core.surface.nominal import Flat, ZernikeSurface
 from omsm_ros.core.surface.posed import Sum
 from omsm_ros.twin.part import PartPose, mounted_surface
 
@@ -71,6 +71,31 @@ def test_form_that_the_pose_hides_does_not_grow_to_cancel_a_long_step(seed):
         columns @ columns.T, columns @ height, 1e-18, mean_square, basis.group, expected
     )
     assert np.linalg.norm(found.form[basis.group == 2]) < mean_square**0.5 / 2
+
+
+def scanned(path):
+    """Return x and y [m] of a scan of the whole disc, along a spiral or the lines of a raster."""
+    if path == "spiral":
+        r, angle = np.linspace(RADIUS, 0, 20_000), np.linspace(0, 200 * np.pi, 20_000)
+        return r * np.cos(angle), r * np.sin(angle)
+    x, y = np.meshgrid(np.linspace(-1, 1, 400), np.linspace(-1, 1, 62)[1:-1])
+    inside = np.hypot(x, y) <= 1
+    return RADIUS * x[inside], RADIUS * y[inside]
+
+
+@pytest.mark.parametrize("path", ["spiral", "raster"])
+@pytest.mark.parametrize("seed", range(3))
+def test_coma_of_a_whole_part_is_no_tilt(path, seed):
+    """Zernike terms over a disc have no tilt in common, wherever single points lie on it."""
+    rng = np.random.default_rng([seed, 5])
+    x, y = scanned(path)
+    form = ZernikeSurface(RADIUS, (0, 0, 0, *(80e-9 * rng.normal(size=12))))
+    height = form.height(x, y) + rng.normal(0, 2e-9, len(x))
+    portion = PointBatch(x, y, height, np.empty((0, len(x))))
+    found = register(Flat(), lambda: [portion], POSE_PARAMETERS[:3], aperture=Aperture(RADIUS))
+    for name in ("tip", "tilt"):
+        assert abs(found.placement.value(name)) < 4 * found.spread.get(name)
+        assert found.spread.get(name) * RADIUS < 0.1e-9
 
 
 @pytest.mark.soak

@@ -27,6 +27,26 @@ AREAS = {
 }
 
 
+@pytest.mark.parametrize(
+    ("text", "area", "square"),
+    [
+        ("2", np.pi * 4, np.pi * 2**4 / 4),
+        ("annulus:2,1", np.pi * 3, np.pi * (2**4 - 1) / 4),
+        ("ellipse:2,3", np.pi * 6, np.pi * 2**3 * 3 / 4),
+    ],
+)
+def test_sums_over_nodes_are_integrals(text, area, square):
+    """∫ dA and ∫ x² dA in closed form, with the middle elsewhere; odd powers cancel."""
+    outline = Aperture.parse(text if text == "2" else f"{text},0.5,-1")
+    x, y, share = outline.nodes()
+    u, v = x - outline.x, y - outline.y
+    assert share.sum() == pytest.approx(area, rel=1e-12)
+    assert share @ u**2 == pytest.approx(square, rel=1e-12)
+    assert share @ (u**7 * v**8) == pytest.approx(0.0, abs=1e-9)
+    assert np.all(outline.holds(x, y))
+    assert Aperture.parse("rectangle:1,2").nodes().shape == (3, 0)
+
+
 def test_an_aperture_holds_its_rim_even_in_float32():
     disc = Aperture(5e-3, 1e-3, -2e-3)
     angle = np.linspace(0, 2 * np.pi, 50)
