@@ -23,17 +23,6 @@ def one_thread_of_blas() -> None:
     os.environ.setdefault(_THREADS, "1")
 
 
-def skip_documentation_of_artists() -> None:
-    """Let matplotlib load without writing the documentation of all properties, in 70 % of the time.
-
-    Call it before the figures are loaded, in a program of its own only: others may show it.
-    """
-    from matplotlib import artist
-
-    artist.kwdoc = lambda _: ""
-    artist.Artist._update_set_signature_and_docstring = classmethod(lambda _: None)  # type: ignore
-
-
 def end_with_parent(number: signal.Signals) -> None:
     """Let Linux send ``number`` to this process when the one that started it ends, even killed."""
     if sys.platform == "linux":

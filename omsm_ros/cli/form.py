@@ -44,7 +44,6 @@ from omsm_ros.io.files import (
     save_text,
 )
 from omsm_ros.io.gcode_file import path_gcode as program_of
-from omsm_ros.loading import skip_documentation_of_artists
 from omsm_ros.messages import text_from
 from omsm_ros.pipelines.form import judge_form, open_measurement
 from omsm_ros.quantities import (
@@ -227,7 +226,6 @@ def _form(args: argparse.Namespace) -> Facts:
         points = open_measurement(source, args.unit, args.channel)
         facts = judge_form(points, surface, out, registration_of(args))
         if not args.no_report:
-            skip_documentation_of_artists()
             # Imported on demand, because it takes longer to load than many forms to evaluate.
             from omsm_ros.pipelines.publish import publish_form
 
