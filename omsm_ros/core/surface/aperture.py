@@ -133,15 +133,18 @@ class Aperture:
         return np.asarray(middle + np.concatenate([self.radius * turn, hole], axis=1))
 
     def nodes(self) -> FloatArray:
-        """Return x, y [m] and areas [m²] that make integrals (3, n); none of sides or corners."""
-        if self.outline in ("rectangle", "polygon"):
+        """Return x, y [m] and areas [m²] that make integrals (3, n); a polygon has none."""
+        if self.outline == "polygon":
             return np.empty((3, 0))
         at, share = np.polynomial.legendre.leggauss(_NODES)
-        a, b = self.sizes if self.outline == "ellipse" else (self.radius,) * 2
-        hole = (self.sizes[0] / self.radius) ** 2 if self.outline == "annulus" else 0.0
-        turn = np.exp(2j * np.pi * np.arange(3 * _NODES) / (3 * _NODES))
-        place = np.outer(np.sqrt(hole + (1 - hole) * (at + 1) / 2), turn).ravel()
-        area = np.repeat(share, len(turn)) * (1 - hole) * np.pi * a * b / 2 / len(turn)
+        a, b = self.sizes if self.outline in ("ellipse", "rectangle") else (self.radius,) * 2
+        if self.outline == "rectangle":
+            place, area = np.add.outer(at, 1j * at).ravel(), a * b * np.outer(share, share).ravel()
+        else:
+            hole = (self.sizes[0] / self.radius) ** 2 if self.outline == "annulus" else 0.0
+            turn = np.exp(2j * np.pi * np.arange(3 * _NODES) / (3 * _NODES))
+            place = np.outer(np.sqrt(hole + (1 - hole) * (at + 1) / 2), turn).ravel()
+            area = np.repeat(share, len(turn)) * (1 - hole) * np.pi * a * b / 2 / len(turn)
         return np.stack([self.x + a * place.real, self.y + b * place.imag, area])
 
     def _corners(self) -> FloatArray:

@@ -33,6 +33,7 @@ AREAS = {
         ("2", np.pi * 4, np.pi * 2**4 / 4),
         ("annulus:2,1", np.pi * 3, np.pi * (2**4 - 1) / 4),
         ("ellipse:2,3", np.pi * 6, np.pi * 2**3 * 3 / 4),
+        ("rectangle:2,3", 24.0, 32.0),
     ],
 )
 def test_sums_over_nodes_are_integrals(text, area, square):
@@ -44,7 +45,7 @@ def test_sums_over_nodes_are_integrals(text, area, square):
     assert share @ u**2 == pytest.approx(square, rel=1e-12)
     assert share @ (u**7 * v**8) == pytest.approx(0.0, abs=1e-9)
     assert np.all(outline.holds(x, y))
-    assert Aperture.parse("rectangle:1,2").nodes().shape == (3, 0)
+    assert Aperture.parse("polygon:0,0,1,0,0,1").nodes().shape == (3, 0)
 
 
 def test_an_aperture_holds_its_rim_even_in_float32():
