@@ -174,7 +174,7 @@ _DOFS = ("piston", "tip", "tilt", "x", "y", "clocking")
 
 
 def _aligned(removed: Mapping[str, Any]) -> list[str]:
-    """Return the degrees of freedom whose uncertainty shall not make that of form larger."""
+    """Return the pose parameters whose uncertainty shall not make that of form larger."""
     every = {*removed["fitted"], *removed["held"], *removed["not_determined"]}
     return [name for name in _DOFS if name in every]
 
