@@ -2,6 +2,7 @@
 
 import os
 import re
+from contextlib import suppress
 from glob import glob
 from pathlib import Path
 
@@ -25,6 +26,24 @@ NODES = (
     "cell_emulator",
     "cell_demo",
 )
+# A command in a workspace. The usual text of setuptools loads other modules for a tenth of a second
+# first, to look up what to run, and Ctrl-C meanwhile ends with a traceback.
+COMMAND = """\
+import signal
+import sys
+from importlib import import_module
+
+before = signal.getsignal(signal.SIGINT)
+if before is signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+main = import_module("omsm_ros.cli" if %(name)r == "omsm" else "omsm_ros.nodes.start").main
+signal.signal(signal.SIGINT, before)
+sys.exit(main())
+"""
+with suppress(ImportError):  # later than 79, which colcon does not use
+    from setuptools.command.easy_install import ScriptWriter
+
+    ScriptWriter.template = COMMAND
 
 setup(
     name=PACKAGE,

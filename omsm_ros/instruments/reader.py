@@ -13,8 +13,8 @@ from omsm_ros.instruments.blocks import BlockPair
 
 # Requests of other threads wait for a read to end, so it is short [s].
 _READ_S = 0.05
-# From one connection to the next: it doubles from the first, the least pause, to the second [s].
-BACK_OFF_S = (0.25, 1.0)
+# From one connection to the next; two counters that were reset need 1.3 s more, and 2 s in all [s].
+BACK_OFF_S = (0.25, 0.5)
 
 
 class State(Enum):

@@ -105,6 +105,22 @@ def test_the_device_own_trouble_is_passed_on() -> None:
     assert complaints == ["measures at 900 Hz"]
 
 
+def test_a_device_that_comes_back_at_any_time_is_connected_within_half_a_second() -> None:
+    """Then two counters, whose stamps agree after 1.3 s, are paired again within 2 s."""
+    waited: list[float] = []
+
+    class Hurried(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            waited.append(timeout or 0.0)
+            return self.is_set()
+
+    stop = Hurried()
+    DeviceReader(Scripted(stop, [DeviceError("gone")] * 20, []), lambda _: None).run(stop)
+    assert len(waited) == 20
+    assert min(waited) >= 0.2
+    assert max(waited) <= 0.5
+
+
 def test_a_stop_ends_a_long_pause_at_once() -> None:
     stop = threading.Event()
     device = Scripted(threading.Event(), [DeviceError("gone")] * 5, [[]])
