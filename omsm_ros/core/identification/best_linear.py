@@ -36,7 +36,8 @@ class BestLinear:
 
     response: distance per position;  uncertainty: standard, of the complex response, from noise
         and distortion;  radius: of the circle that contains it with 95 %
-    noise, distortion, transient: of one realisation in the mean of its periods
+    noise, distortion: of one realisation in the mean of its periods
+    transient: of the first period less the last; of two periods it counts as noise
     odd, even: frequencies (d,) [Hz] and levels (d,) of distortion at lines that are not excited
     """
 
@@ -74,9 +75,7 @@ def best_linear_approximation(record: MotionRecord, plan: MultisinePlan) -> Best
 
     Raises IdentificationError for another motion, or where too many readings are lost.
     """
-    motion, output = _periods(record, plan)
-    amplitude = np.sqrt(2) / plan.period
-    u, y = (amplitude * np.fft.rfft(values, axis=2) for values in (motion, output))
+    u, y = np.sqrt(2) / plan.period * np.fft.rfft(_periods(record, plan))
     mean_u, mean_y = np.mean(u, axis=1), np.mean(y, axis=1)
     lines, realisations, periods = np.asarray(plan.lines), len(u), u.shape[1]
     power = np.sum(np.abs(mean_u[:, lines]) ** 2, axis=0)
@@ -84,10 +83,9 @@ def best_linear_approximation(record: MotionRecord, plan: MultisinePlan) -> Best
     # Between excited lines the response is interpolated; the motion there is small.
     every = np.interp(np.arange(u.shape[2]), lines, response)
     missed = y - every * u
-    left = mean_y - every * mean_u
-    scatter = missed - np.mean(missed, axis=1, keepdims=True)
-    noise = np.mean(np.sum(np.abs(scatter) ** 2, axis=1), axis=0) / (periods * (periods - 1))
-    total = np.sum(np.abs(left) ** 2, axis=0)
+    # From the last two periods, because a transient decays.
+    noise = np.mean(np.abs(missed[:, -1] - missed[:, -2]) ** 2, axis=0) / (2 * periods)
+    total = np.sum(np.abs(mean_y - every * mean_u) ** 2, axis=0)
     excited = total[lines] / (realisations - 1)
     early = np.mean(np.abs(missed[:, 0] - missed[:, -1]) ** 2, axis=0) - 2 * periods * noise
     uncertainty = np.sqrt(excited / power)
@@ -109,8 +107,8 @@ def best_linear_approximation(record: MotionRecord, plan: MultisinePlan) -> Best
     )
 
 
-def _periods(record: MotionRecord, plan: MultisinePlan) -> tuple[FloatArray, FloatArray]:
-    """Return motion and distance of all whole periods (realisations, periods, samples)."""
+def _periods(record: MotionRecord, plan: MultisinePlan) -> FloatArray:
+    """Return motion and distance of all whole periods (2, realisations, periods, samples)."""
     lost = 1 - float(np.mean(record.ok))
     if lost > _MOST_LOST:
         raise IdentificationError("identification.multisine_lost", lost=lost, most=_MOST_LOST)
@@ -132,15 +130,17 @@ def _periods(record: MotionRecord, plan: MultisinePlan) -> tuple[FloatArray, Flo
     index = np.arange(len(record))
     distance = np.interp(index, index[record.ok], record.distance[record.ok])
     shape = (plan.realisations, plan.periods + 1, plan.period)
-    motion, output = (
+    motion, output, known = (
         values[start : start + np.prod(shape)].reshape(shape)[:, 1:]
-        for values in (record.z, distance)
+        for values in (record.z, distance, record.ok)
     )
     # Less the linear drift of each realisation, from its periods.
-    periods, samples = output.shape[1:]
-    slope = np.mean(output[:, -1] - output[:, 0], axis=1) / (samples * max(periods - 1, 1))
-    time = np.arange(periods * samples).reshape(periods, samples)
-    return np.asarray(motion), np.asarray(output - slope[:, np.newaxis, np.newaxis] * time)
+    time = np.arange(output[0].size).reshape(output.shape[1:])
+    slope = np.mean(output[:, -1] - output[:, 0], axis=1) / time[-1, 0]
+    both = np.stack([motion, output - slope[:, np.newaxis, np.newaxis] * time])
+    # A lost sample is that of the last period with it: an error of interpolation looks like noise.
+    last = plan.periods - 1 - np.argmax(known[:, ::-1], axis=1, keepdims=True)
+    return np.where(known, both, np.take_along_axis(both, last[np.newaxis], axis=2))
 
 
 def multisine_findings(

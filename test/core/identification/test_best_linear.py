@@ -70,6 +70,23 @@ def test_a_linear_machine_shows_no_distortion_and_its_own_response():
     assert np.sqrt(np.mean(found.noise**2)) == pytest.approx(expected, rel=0.25, abs=0)
 
 
+def test_neither_a_transient_nor_lost_readings_count_as_noise():
+    """A mode of 40 Hz decays by e^-4 in a period of 1 s, so the last two periods show the noise."""
+    one = plan(1, periods=4)
+    record = recorded(one, 0.0, 2e-9, 5)
+    pole = np.exp((-4.0 + 2j * np.pi * 40.0) * PERIOD)
+    ringing = [1.0, -2 * pole.real, abs(pole) ** 2]
+    distance = signal.lfilter([sum(ringing)], ringing, record.z - record.z[0])
+    distance += np.random.default_rng(6).normal(0, 2e-9, len(distance))
+    lost = np.random.default_rng(7).random(len(distance)) < 0.005
+    ringing = replace(record, ok=~lost, distance=np.where(lost, np.nan, distance))
+    found = best_linear_approximation(ringing, one)
+    expected = np.sqrt(2) * 2e-9 / np.sqrt(4 * one.period)
+    assert np.sqrt(np.mean(found.noise**2)) == pytest.approx(expected, rel=0.25, abs=0)
+    # Of each realisation but the first, one period after the phases changed.
+    assert np.sqrt(np.sum(found.transient**2)) > 20e-9
+
+
 def test_circles_of_a_wiener_hammerstein_machine_contain_its_best_linear_approximation():
     """The truth is the mean over many realisations of other phases."""
     inside, distortion, cubic = [], [], 0.3
