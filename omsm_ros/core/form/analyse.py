@@ -18,13 +18,15 @@ from omsm_ros.core.form.deviation_map import (
     profile_noise,
     repeated_noise,
 )
-from omsm_ros.core.form.part_extents import MOST_UNSEEN, Gaps, extents_of_parts
+from omsm_ros.core.form.part_extents import extents_of_parts
 from omsm_ros.core.form.part_figures import (
     FORM,
+    MOST_UNSEEN,
     POWER,
     SECOND_ORDER,
     SYMMETRIC,
     TILT,
+    Gaps,
     SmoothTerms,
     best_fit,
     fitted,
@@ -199,18 +201,11 @@ class FormResult:
 
 
 def analyse_form(
-    surface: Surface,
-    portions: PointBatches,
-    asked: Sequence[str],
-    *,
-    sources: Sequence[str] = (),
-    bounds: Sequence[str] = (),
-    aperture: Aperture | None = None,
-    even: bool = False,
-    filters: tuple[float | None, float | None] = (None, None),
-    dust: DustRule = ISOLATED,
+    surface: Surface, portions: PointBatches, asked: Sequence[str], *, sources: Sequence[str] = (),
+    bounds: Sequence[str] = (), aperture: Aperture | None = None, even: bool = False,
+    filters: tuple[float | None, float | None] = (None, None), dust: DustRule = ISOLATED,
     declared: Mapping[str, float] = MappingProxyType({}),
-) -> FormResult:
+) -> FormResult:  # fmt: skip
     """Register the points and evaluate their deviations.
 
     As in :func:`register`, and  bounds: sources of which only an upper bound is known

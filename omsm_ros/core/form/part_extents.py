@@ -11,9 +11,8 @@ with p = 2 for errors of smooth shape, and less for noise, for which points comp
 terms, means of neighbours and a Wiener filter remove most of the noise; the rest counts as an
 error. Form taken for a move and upper bounds count as in :mod:`omsm_ros.core.form.part_figures`.
 
-A scan sees the part on its tracks only. What the form may reach between them, and from the last
-track to the rim, is extrapolated; half of it is added, and as much is the standard uncertainty.
-So is half of what single points show alone, which may be dust, subtracted.
+What the form may reach between the tracks is extrapolated; half of it is added, and as much is the
+standard uncertainty. So is half of what single points show alone, which may be dust, subtracted.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from omsm_ros.core.form.deviation_map import DeviationMap, UncertainValue
 from omsm_ros.core.form.part_figures import (
+    Gaps,
     either,
     length,
     of_square,
@@ -33,7 +32,7 @@ from omsm_ros.core.form.part_figures import (
     with_and_without,
     without_noise,
 )
-from omsm_ros.core.form.zernike_fit import RimStrip, ZernikeFit, continued, fit_zernikes, separable
+from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes, separable
 from omsm_ros.core.registration.pose_parameters import root_of
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
@@ -51,8 +50,8 @@ _CONDITION = 1e7
 _MOST_FITTED, _MOST_DRAWN = 20_000, 2_000
 # 200 draws give a standard deviation to 5 %.
 _DRAWS, _SEED = 200, 7
-# Halvings of the cells that show local features, and points at either extreme.
-_HALVINGS, _HALF = 4, 500
+# Halvings of the cells that show local features; points at either extreme, and places of the rim.
+_HALVINGS, _HALF, _OF_RIM = 4, 500, 48
 # The grid of cells may divide a feature. On one of three grids a third of a cell apart, any lies
 # within a cell of a few times its size.
 _SHIFTS = (0.0, 1 / 3, 2 / 3)
@@ -60,21 +59,6 @@ _SHIFTS = (0.0, 1 / 3, 2 / 3)
 _CHANCE = 3.0
 # Least variance, so that a part without noise keeps all terms [m²].
 _TINY = 1e-40
-# Points that continue the form to a place of the rim; how far they may be off, in distances of the
-# tracks; number of places.
-_AROUND, _REACH, _PLACES = 24, 1.5, 360
-# Neighbours on the next tracks, way to the middle between two, and the surroundings of a peak, in
-# distances of the tracks; distance of the middle of the neighbours beyond which it is at the rim.
-_NEXT, _HALF_WAY, _AWAY, _ONE_SIDED = (0.7, 1.3), 0.5, (2.0, 3.5), 0.3
-# Peaks and single points at either end, and share of the height of a peak that is hidden.
-# Share that the neighbours of a peak show unless it is a single point.
-_PEAKS, _SINGLE, _UNSEEN, _COMPANY = 6, 24, 0.05, 1 / 3
-# Most by which a summit that both neighbouring tracks miss exceeds what one track shows of it.
-MOST_UNSEEN = float(_UNSEEN ** -(_HALF_WAY**2))
-# Places about a peak up to the middle of four points of a raster, in distances of the tracks.
-_ABOUT = np.outer(np.arange(1, 7) / 8, np.exp(1j * np.arange(24) * np.pi / 12)).reshape(-1, 1)
-# Least singular value of a parabola through neighbours.
-_LEAST_SPREAD = 1e-2
 
 
 def extents_of_parts(
@@ -144,14 +128,20 @@ class _PartForm(NamedTuple):
         even = map_.equal_areas(_MOST_DRAWN)
         order = self.local[np.argsort(form[self.local])]
         some = np.concatenate([even, order[:_HALF], order[-_HALF:]])
-        drawn = _drawn(map_.part(some), self, form[some], some)
-        beyond, alone = gaps.beyond(self, form) if gaps else np.zeros((2, 2))
+        rim, (beyond, alone) = np.empty((2, 0)), np.zeros((2, 2))
+        if gaps is not None:
+            rest = self.above + shift
+            rim = gaps.at_rim(form, rest, self.smooth, self.local, self.error)
+            beyond, alone = gaps.beyond(form, self.above, rim[0], self.unseen, self.error)
+        rows = self._drawn_to_rim(map_, form, some, gaps, rim)
+        of_rim = [np.max(way * rim[0], initial=np.max(way * form)) - np.max(way * form)
+                  for way in (-1, 1)]  # fmt: skip
         of_waves = [np.max(way * form + self.texture) - np.max(way * form) for way in (-1, 1)]
         found = []
-        many = form[map_.equal_areas(_MOST_FITTED)]
-        shares = ((0.0, 1.0), form, len(some)), (ROBUST, many, len(even))
+        many, form = form[map_.equal_areas(_MOST_FITTED)], np.append(form, rim[0])
+        shares = ((0.0, 1.0), form, len(rows[0])), (ROBUST, many, len(even))
         for ends, all_, count in shares[: 1 + robust]:
-            of_some, *ways = (_extents(way[:count], ends) for way in (form[some], *drawn))
+            of_some, *ways = (_extents(way[:count], ends) for way in rows)
             again, more, likely, full, noise = (way**2 for way in ways)
             bare, open_ = without_noise(float(of_some), ways[-1])
             square = bare * abs(bare) - float(np.mean(again - noise) - np.mean(likely) + of_some**2)
@@ -167,8 +157,27 @@ class _PartForm(NamedTuple):
             figure = of_square(square, of_all)
             between = np.append(np.maximum(beyond, of_waves), -alone) / 2 * (all_ is form)
             value = (figure.value or 0.0) + _extents(all_, ends) - of_some + float(np.sum(between))
-            found.append(UncertainValue(float(value), length(figure.uncertainty or 0.0, *between)))
+            of_gaps = length(*between, *np.divide(of_rim, 2) * (all_ is form))
+            found.append(UncertainValue(float(value), length(figure.uncertainty or 0.0, of_gaps)))
         return found[0], found[1] if robust else UncertainValue(None, None)
+
+    def _drawn_to_rim(self, map_: DeviationMap, form: FloatArray, some: IntArray, gaps: Gaps | None,
+                      rim: FloatArray) -> list[FloatArray]:  # fmt: skip
+        """Return the ``form`` of ``some`` points and the ends of the ``rim`` (m,), and as drawn."""
+        if gaps is None:
+            return [form[some], *_drawn(map_.part(some), self, form[some], some)]
+        order = np.argsort(rim[0])
+        ends = np.unique(np.append(order[:_OF_RIM], order[-_OF_RIM:]))
+        points, count, (at_rim, open_) = np.append(some, gaps.near[ends]), len(some), rim[:, ends]
+        drawn = _drawn(map_.part(points), self, form[points], points)
+        open_ = np.outer(open_, np.random.default_rng(_SEED + 1).normal(size=_DRAWS))
+        rows = [np.append(form[some], at_rim)]
+        for way, share in zip(drawn, (open_, open_, 0.0, 0.0, 0.0), strict=True):
+            # Errors continue to the rim as the form does.
+            errors = (way.T - form[points])[:, count:].reshape(_DRAWS, len(ends), -1)
+            moved = np.einsum("qk,dqk->qd", gaps.weights[0, ends], errors)
+            rows.append(np.concatenate([way[:count], (at_rim + moved.T).T + share]))
+        return rows
 
 
 def _extents(values: FloatArray, ends: tuple[float, float]) -> FloatArray:
@@ -176,153 +185,6 @@ def _extents(values: FloatArray, ends: tuple[float, float]) -> FloatArray:
     if ends != (0.0, 1.0):
         values = np.quantile(values, ends, axis=0, method="hazen")
     return np.asarray(np.ptp(values, axis=0))
-
-
-class Gaps(NamedTuple):
-    """Places that the tracks miss.
-
-    x, y: of the points (n,) [m];  spacing: of the tracks [m]
-    near: points (q, k), the nearest first;  weights: of their sums that continue the form to a
-        place of the rim, and that add to it if the curvature rises (2, q, k)
-    strip: along the rim, for the mean square of the form; None for an annulus
-    share: of the area that half a track along the rim has
-    """
-
-    x: FloatArray
-    y: FloatArray
-    spacing: float
-    near: IntArray
-    weights: FloatArray
-    strip: RimStrip | None
-    share: float
-
-    @classmethod
-    def of(
-        cls, map_: DeviationMap, outline: Aperture, spacing: float, strip: RimStrip | None = None
-    ) -> Gaps | None:
-        """Return the gaps between the points and to the ``outline``; None for a profile.
-
-        strip: along the rim, for sums of piston and other terms, weighted by area
-        """
-        from scipy.spatial import cKDTree  # takes long to load
-
-        some = np.arange(0, len(map_), -(-len(map_) // _MOST_FITTED))
-        x, y = map_.x[some], map_.y[some]
-        if len(x) < _AROUND or min(np.ptp(x), np.ptp(y)) < _REACH * spacing:
-            return None
-        corners = outline.rim()
-        (u, v), way = corners, np.cumsum(np.hypot(*np.diff(corners, prepend=corners[:, :1])))
-        at = np.linspace(0, way[-1], _PLACES, endpoint=False)
-        rim = np.stack([np.interp(at, way, u), np.interp(at, way, v)])
-        away, near = cKDTree(np.column_stack([x, y])).query(rim.T, _AROUND)
-        close = away[:, 0] < _REACH * spacing
-        near, rim = near[close], rim[:, close, np.newaxis]
-        parabola, plane = continued((x[near] - rim[0] + 1j * (y[near] - rim[1])) / spacing)
-        weights = np.stack([parabola, (parabola - plane) / 2])
-        if strip is not None:
-            strip = RimStrip(strip.points, *(v[:1] / map_.area.sum() for v in strip[1:]))
-        share = float(way[-1]) * spacing / abs(float(np.sum(u[:-1] * v[1:] - u[1:] * v[:-1])))
-        return cls(map_.x, map_.y, spacing, some[near], weights, strip, share)
-
-    def square(self, values: FloatArray) -> tuple[float, float]:
-        """Return what form beyond the last track adds to the mean square of ``values`` (n,) [m].
-
-        Second is the standard uncertainty of that [m²].
-        """
-        if self.strip is not None:
-            more, errors = self.strip.missed(values[self.strip.points] ** 2)
-            return float(more[0]), float(np.linalg.norm(errors))
-        rim, last = np.sum(self.weights[0] * values[self.near], axis=1), values[self.near[:, 0]]
-        return 0.0, self.share * abs(float(np.mean(rim**2 - last**2))) / 2 if len(rim) else 0.0
-
-    def beyond(self, part: _PartForm, form: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return how far the form may reach beyond its extremes, and fall short of them (2,) [m].
-
-        form: of the points of the ``part`` (n,) [m]
-        """
-        rim, further = np.sum(self.weights * form[self.near], axis=2)
-        weights, found, alone = np.sum(self.weights, axis=0), [], []
-        chance = 2 * np.sqrt(np.sum((weights * part.error[self.near]) ** 2, axis=1))
-        for sign, unseen in zip((-1, 1), part.unseen, strict=True):
-            values = sign * form
-            # Form that flattens ends where it is.
-            at_rim = sign * rim + np.maximum(sign * further, 0.0) - chance
-            summit = self._summit(values + unseen, sign * part.above + unseen, part.error)
-            found.append(float(np.max(at_rim, initial=summit) - values.max()))
-            alone.append(self._alone(values, sign * part.above))
-        return np.maximum(found, 0.0), np.array(alone)
-
-    def _summit(self, values: FloatArray, above: FloatArray, noise: FloatArray) -> float:
-        """Return how high ``values`` (n,) [m] may be between the tracks.
-
-        above: smooth form (n,) [m], which tells what may be highest
-        """
-        may, highest = values + (MOST_UNSEEN - 1) * np.maximum(above, 0.0), float(values.max())
-        for _ in range(_PEAKS):
-            peak = int(np.argmax(may))
-            near, at = self._about(peak)
-            rise = _rise(at, values[near], values[peak], float(noise[peak]))
-            highest = max(highest, float(values[peak]) + rise)
-            may[near] = -np.inf
-        return highest
-
-    def _alone(self, values: FloatArray, above: FloatArray) -> float:
-        """Return how far single points of ``values`` exceed all that neighbours show, (n,) [m]."""
-        # Heights ``above`` the smooth form (n,) [m] decide: a slope makes no point single.
-        left, most = values.copy(), 0.0
-        for _ in range(_SINGLE):
-            peak = int(np.argmax(left))
-            near, at = self._about(peak)
-            others = (away := np.abs(at)) > 0
-            shown, dense = above[near[others & (away < _NEXT[1])]], np.any(away[others] < _HALF_WAY)
-            base = float(np.median(shown if dense else above[near]))
-            own = float(above[peak]) - base
-            if not np.max(shown, initial=-np.inf) - base < _COMPANY * own:
-                break
-            left[peak], most = -np.inf, max(most, own)
-        return min(float(values.max() - left.max()), most)
-
-    def _about(self, peak: int) -> tuple[IntArray, NDArray[np.complex128]]:
-        """Return the points (k,) about a ``peak``, and their places in distances of the tracks."""
-        reach, middle = _AWAY[1] * self.spacing, self.x[peak]
-        near = np.flatnonzero((self.x > middle - reach) & (self.x < middle + reach))
-        at = ((self.x[near] - middle) + 1j * (self.y[near] - self.y[peak])) / self.spacing
-        about = np.abs(at) < _AWAY[1]
-        return near[about], at[about]
-
-
-def _rise(at: NDArray[np.complex128], values: FloatArray, peak: float, noise: float) -> float:
-    """Return how far the summit of a Gaussian through ``values`` (n,) [m] exceeds their ``peak``.
-
-    The summit is half way to the next track at most. Where the neighbouring tracks miss it, it is
-    there, and as wide as that allows. A cone is higher: form may rise from each place as steeply as
-    the peak falls to a neighbouring track (E. McShane, Bull. Am. Math. Soc. 40, 837).
-
-    at: places about the peak in distances of the tracks (n,);  noise: of the peak [m]
-    """
-    away = np.abs(at)
-    around, ring = away > _AWAY[0], (away > _NEXT[0]) & (away < _NEXT[1])
-    # At the rim there is none on the other side.
-    if not (np.any(around) and np.any(ring)) or abs(np.mean(at[ring])) > _ONE_SIDED:
-        return 0.0
-    height = peak - float(np.median(values[around]))
-    floor = max(2 * noise, _UNSEEN * height)
-    if height <= floor:
-        return 0.0
-    steepest = max(float(np.max((peak - values[ring]) / away[ring])), 0.0)
-    cone = float(np.max(np.min(values + steepest * np.abs(_ABOUT - at), axis=1))) - peak
-    if np.median(values[ring]) <= peak - height + floor:
-        return max(float(height * ((height / floor) ** _HALF_WAY**2 - 1)), cone)
-    near = (away > 0) & (away < _NEXT[1])
-    fall = np.log(height / np.clip(height - peak + values[near], floor, height))
-    u, v = at[near].real, at[near].imag
-    columns = np.stack([u, v, u * u, u * v, v * v], axis=1)
-    *slope, a, b, c = np.linalg.lstsq(columns, fall, rcond=_LEAST_SPREAD)[0]
-    curved, ways = np.linalg.eigh([[a, b / 2], [b / 2, c]])
-    slope, curved = np.abs(ways.T @ slope), np.maximum(curved, np.finfo(np.float64).tiny)
-    way = np.minimum(slope / (2 * curved), _HALF_WAY)
-    gaussian = float(height * min(np.expm1(slope @ way - curved @ way**2), MOST_UNSEEN - 1))
-    return max(gaussian, cone)
 
 
 def _local_features(

@@ -4,6 +4,9 @@ Form that the fit of the pose may have taken for a move is missing from the devi
 independent of the form that is left, so its probable mean square is added; its uncertainty belongs
 to the figure. Upper bounds of errors, as of an unknown latency, are not subtracted; the change of
 the square by an error of that size belongs to the uncertainty.
+
+A scan sees the part on its tracks only. Between them a peak may be higher than its points, and
+from the last track to the rim the form goes on.
 """
 
 from __future__ import annotations
@@ -14,10 +17,19 @@ from math import comb
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omsm_ros.core.form.deviation_map import DeviationMap, GridCells, UncertainValue
-from omsm_ros.core.form.zernike_fit import CHUNK, DIFFERENCES, normal_equations, passes
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.form.zernike_fit import (
+    CHUNK,
+    DIFFERENCES,
+    RimStrip,
+    ZernikeFit,
+    continued,
+    normal_equations,
+    passes,
+)
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 
@@ -206,3 +218,206 @@ def without_noise(once: float, again: FloatArray) -> tuple[float, float]:
     left = [once**p - (np.mean(again**p) - once**p) / (2 ** (p / 2) - 1) for p in _POWERS]
     found = [float(np.sign(v) * abs(v) ** (1 / p)) for v, p in zip(left, _POWERS, strict=True)]
     return found[1], float(np.ptp(found)) / np.sqrt(12)
+
+
+# Points that continue the form to a place of the rim; how far they may be off, in distances of the
+# tracks; least number of places; width of the strip that has these points, in both.
+_AROUND, _REACH, _PLACES, _STRIP = 24, 1.5, 360, 12.0
+# Longest steps along a path over the distance of its tracks, as of points in no order, and that
+# distance over the shortest.
+_MOST_ALONG, _DENSEST = 4.0, 1000.0
+# Neighbours on the next tracks, way to the middle between two, and the surroundings of a peak, in
+# distances of the tracks; distance of the middle of the neighbours beyond which it is at the rim.
+_NEXT, _HALF_WAY, _AWAY, _ONE_SIDED = (0.7, 1.3), 0.5, (2.0, 3.5), 0.3
+# Peaks and single points at either end, and share of the height of a peak that is hidden.
+# Share that the neighbours of a peak show unless it is a single point.
+_PEAKS, _SINGLE, _UNSEEN, _COMPANY = 6, 24, 0.05, 1 / 3
+# Most by which a summit that both neighbouring tracks miss exceeds what one track shows of it.
+MOST_UNSEEN = float(_UNSEEN ** -(_HALF_WAY**2))
+# Places about a peak up to the middle of four points of a raster, in distances of the tracks.
+_ABOUT = np.outer(np.arange(1, 7) / 8, np.exp(1j * np.arange(24) * np.pi / 12)).reshape(-1, 1)
+# Least singular value of a parabola through neighbours.
+_LEAST_SPREAD = 1e-2
+
+
+class Gaps(NamedTuple):
+    """Places that the tracks miss.
+
+    x, y: of the points (n,) [m]
+    spacing: of the tracks about each point, or of points along them that are wider apart (n,) [m]
+    rim: places on the outline (2, q) [m];  near: points about them (q, k), the nearest first
+    weights: of their sums that continue the form to these places, and of those by which sums of
+        fewer points differ (2, q, k)
+    strip: along the rim, for the mean square of the form; None for an annulus
+    share: of the area that half a track along the rim has
+    """
+
+    x: FloatArray
+    y: FloatArray
+    spacing: FloatArray
+    rim: FloatArray
+    near: IntArray
+    weights: FloatArray
+    strip: RimStrip | None
+    share: float
+
+    @classmethod
+    def of(
+        cls, map_: DeviationMap, outline: Aperture, spacing: float, strip: RimStrip | None = None
+    ) -> Gaps | None:
+        """Return the gaps between the points and to the ``outline``; None for a profile.
+
+        strip: along the rim, for sums of piston and other terms, weighted by area
+        """
+        from scipy.spatial import cKDTree  # takes long to load
+
+        extent = min(np.ptp(map_.x), np.ptp(map_.y))
+        if len(map_) < _AROUND or extent < _REACH * spacing:
+            return None
+        steps, most = np.hypot(np.diff(map_.x), np.diff(map_.y)), _MOST_ALONG * spacing
+        along = np.minimum(np.append(steps[:1], steps), np.append(steps, steps[-1:]))
+        # Points in no order have steps across the part.
+        local = np.clip(along if (usual := np.median(steps)) < most else 0 * along, spacing, most)
+        size, depth = outline.share_of_rim(map_.x, map_.y), _STRIP * spacing / extent
+        hole = outline.sizes[0] / outline.radius if outline.outline == "annulus" else -depth
+        # More points along a track than across would hide what is across it.
+        some = np.flatnonzero((size > 1 - depth) | (size < hole + depth))
+        some = some[:: max(int(spacing / 2 / max(usual, spacing / _DENSEST)), 1)]
+        some = some if len(some) >= _AROUND else np.arange(len(map_))
+        corners = outline.rim()
+        (u, v), way = corners, np.cumsum(np.hypot(*np.diff(corners, prepend=corners[:, :1])))
+        at = np.linspace(0, way[-1], max(_PLACES, int(way[-1] / spacing)), endpoint=False)
+        rim = np.stack([np.interp(at, way, u), np.interp(at, way, v)])
+        away, near = cKDTree(np.stack([map_.x, map_.y], axis=1)[some]).query(rim.T, _AROUND)
+        near, place, (du, dv) = some[near], rim[0] + 1j * rim[1], np.gradient(rim, axis=1)
+        apart = map_.x[near].T + 1j * map_.y[near].T - place
+        # Within a sector that was not measured all points lie on one side.
+        sides = (apart * (du - 1j * dv)).real
+        close = (away[:, 0] < _REACH * local[near[:, 0]]) & (np.ptp(np.sign(sides), axis=0) > 1)
+        near, rim, apart = near[close], rim[:, close], apart[:, close]
+        parabola, _ = continued(apart.T / spacing)
+        weights = np.stack([parabola, parabola])
+        weights[1, :, : _AROUND // 2] -= continued(apart.T[:, : _AROUND // 2] / spacing)[0]
+        if strip is not None:
+            strip = RimStrip(strip.points, *(v[:1] / map_.area.sum() for v in strip[1:]))
+        share = float(way[-1]) * spacing / abs(float(np.sum(u[:-1] * v[1:] - u[1:] * v[:-1])))
+        return cls(map_.x, map_.y, local, rim, near, weights, strip, share)
+
+    def square(self, values: FloatArray) -> tuple[float, float]:
+        """Return what form beyond the last track adds to the mean square of ``values`` (n,) [m].
+
+        Second is the standard uncertainty of that [m²].
+        """
+        if self.strip is not None:
+            more, errors = self.strip.missed(values[self.strip.points] ** 2)
+            return float(more[0]), float(np.linalg.norm(errors))
+        rim, last = np.sum(self.weights[0] * values[self.near], axis=1), values[self.near[:, 0]]
+        return 0.0, self.share * abs(float(np.mean(rim**2 - last**2))) / 2 if len(rim) else 0.0
+
+    def at_rim(self, form: FloatArray, rest: FloatArray, smooth: ZernikeFit, local: IntArray,
+               noise: FloatArray) -> FloatArray:  # fmt: skip
+        """Return the form at the rim and its standard uncertainty (2, q) [m], without noise.
+
+        A parabola continues the form; how far one through half of its points differs is the
+        uncertainty. Where smooth terms are the form, the mean of both counts, and half their gap.
+
+        form, rest: of the points, and less its ``smooth`` terms (n,) [m];  noise: of both (n,) [m]
+        local: points of other form, about which smooth terms are not valid
+        """
+        found, plain = np.sum(self.weights * form[self.near], axis=2), np.ones(len(form), np.bool_)
+        of_noise = np.sum((self.weights[1] * noise[self.near]) ** 2, axis=1)
+        found[1], plain[local] = np.sqrt(np.maximum(found[1] ** 2 - of_noise, 0.0)), False
+        other = np.sum(self.weights[0] * rest[self.near], axis=1) + smooth.height(*self.rim)
+        half = (other - found[0]) / 2
+        return np.where(np.all(plain[self.near], axis=1), [found[0] + half, half], found)
+
+    def beyond(
+        self, form: FloatArray, above: FloatArray, rim: FloatArray, unseen: FloatArray,
+        noise: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+        """Return how far the form may reach beyond its extremes, and fall short of them (2,) [m].
+
+        form, above: of the points, and less its smooth terms (n,) [m];  rim: the form there (q,)
+        unseen: how far the form may reach below and above its points (2, n) [m]
+        noise: of the form (n,) [m]
+        """
+        found, alone = [], []
+        for sign, more in zip((-1, 1), unseen, strict=True):
+            values, rest = sign * form, sign * above
+            summit = self._summit(values + more, rest + more, noise)
+            found.append(max(summit - float(np.max(sign * rim, initial=values.max())), 0.0))
+            alone.append(self._alone(values, rest))
+        return np.array(found), np.array(alone)
+
+    def _summit(self, values: FloatArray, above: FloatArray, noise: FloatArray) -> float:
+        """Return how high ``values`` (n,) [m] may be between the tracks.
+
+        above: smooth form (n,) [m], which tells what may be highest
+        """
+        may, highest = values + (MOST_UNSEEN - 1) * np.maximum(above, 0.0), float(values.max())
+        for _ in range(_PEAKS):
+            peak = int(np.argmax(may))
+            near, at = self._about(peak)
+            rise = _rise(at, values[near], values[peak], float(noise[peak]))
+            highest = max(highest, float(values[peak]) + rise)
+            may[near] = -np.inf
+        return highest
+
+    def _alone(self, values: FloatArray, above: FloatArray) -> float:
+        """Return how far single points of ``values`` exceed all that neighbours show, (n,) [m]."""
+        # Heights ``above`` the smooth form (n,) [m] decide: a slope makes no point single.
+        left, most = values.copy(), 0.0
+        for _ in range(_SINGLE):
+            peak = int(np.argmax(left))
+            near, at = self._about(peak)
+            others = (away := np.abs(at)) > 0
+            shown, dense = above[near[others & (away < _NEXT[1])]], np.any(away[others] < _HALF_WAY)
+            base = float(np.median(shown if dense else above[near]))
+            own = float(above[peak]) - base
+            if not np.max(shown, initial=-np.inf) - base < _COMPANY * own:
+                break
+            left[peak], most = -np.inf, max(most, own)
+        return min(float(values.max() - left.max()), most)
+
+    def _about(self, peak: int) -> tuple[IntArray, NDArray[np.complex128]]:
+        """Return the points (k,) about a ``peak``, and their places in distances of the tracks."""
+        spacing, middle = self.spacing[peak], self.x[peak]
+        reach = _AWAY[1] * spacing
+        near = np.flatnonzero((self.x > middle - reach) & (self.x < middle + reach))
+        at = ((self.x[near] - middle) + 1j * (self.y[near] - self.y[peak])) / spacing
+        about = np.abs(at) < _AWAY[1]
+        return near[about], at[about]
+
+
+def _rise(at: NDArray[np.complex128], values: FloatArray, peak: float, noise: float) -> float:
+    """Return how far the summit of a Gaussian through ``values`` (n,) [m] exceeds their ``peak``.
+
+    The summit is half way to the next track at most. Where the neighbouring tracks miss it, it is
+    there, and as wide as that allows. A cone is higher: form may rise from each place as steeply as
+    the peak falls to a neighbouring track (E. McShane, Bull. Am. Math. Soc. 40, 837).
+
+    at: places about the peak in distances of the tracks (n,);  noise: of the peak [m]
+    """
+    away = np.abs(at)
+    around, ring = away > _AWAY[0], (away > _NEXT[0]) & (away < _NEXT[1])
+    # At the rim there is none on the other side.
+    if not (np.any(around) and np.any(ring)) or abs(np.mean(at[ring])) > _ONE_SIDED:
+        return 0.0
+    height = peak - float(np.median(values[around]))
+    floor = max(2 * noise, _UNSEEN * height)
+    if height <= floor:
+        return 0.0
+    steepest = max(float(np.max((peak - values[ring]) / away[ring])), 0.0)
+    cone = float(np.max(np.min(values + steepest * np.abs(_ABOUT - at), axis=1))) - peak
+    if np.median(values[ring]) <= peak - height + floor:
+        return max(float(height * ((height / floor) ** _HALF_WAY**2 - 1)), cone)
+    near = (away > 0) & (away < _NEXT[1])
+    fall = np.log(height / np.clip(height - peak + values[near], floor, height))
+    u, v = at[near].real, at[near].imag
+    columns = np.stack([u, v, u * u, u * v, v * v], axis=1)
+    *slope, a, b, c = np.linalg.lstsq(columns, fall, rcond=_LEAST_SPREAD)[0]
+    curved, ways = np.linalg.eigh([[a, b / 2], [b / 2, c]])
+    slope, curved = np.abs(ways.T @ slope), np.maximum(curved, np.finfo(np.float64).tiny)
+    way = np.minimum(slope / (2 * curved), _HALF_WAY)
+    gaussian = float(height * min(np.expm1(slope @ way - curved @ way**2), MOST_UNSEEN - 1))
+    return max(gaussian, cone)

@@ -136,12 +136,9 @@ class _FilteredBand:
 
 
 def texture(
-    cells: GridCells,
-    formless: GridCells,
-    bands: Bands,
-    points: DeviationMap | None = None,
+    cells: GridCells, formless: GridCells, bands: Bands, points: DeviationMap | None = None,
     rest: GridCells | None = None,
-) -> dict[str, UncertainValue]:
+) -> dict[str, UncertainValue]:  # fmt: skip
     """Return Sa, Sq, Sz [m], Ssk, Sku, Sdq [1] of the S-L surface, rms by band [m], slopes [1].
 
     formless: the same cells after the F-operation
@@ -228,13 +225,9 @@ def _cutoffs(cells: GridCells, short: float | None) -> list[tuple[float, float]]
 
 
 def _band(
-    cells: GridCells,
-    short: float | None,
-    long: float | None,
-    planes: list[FloatArray] | None = None,
-    *,
-    between: bool = False,
-) -> _FilteredBand:
+    cells: GridCells, short: float | None, long: float | None,
+    planes: list[FloatArray] | None = None, *, between: bool = False,
+) -> _FilteredBand:  # fmt: skip
     """Return the present cells between an S- and an L-filter (ISO 25178-2).
 
     planes: of their mean, if they are known

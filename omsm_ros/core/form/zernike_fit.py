@@ -102,18 +102,11 @@ class ZernikeFit:
 
 
 def fit_zernikes(
-    x: FloatArray,
-    y: FloatArray,
-    deviation: FloatArray,
-    terms: Sequence[ZernikeIndex],
-    disc: Aperture,
-    *,
-    weights: FloatArray | None = None,
-    effects: FloatArray | None = None,
-    condition: float = _WORST_CONDITION,
-    strip: RimStrip | None = None,
+    x: FloatArray, y: FloatArray, deviation: FloatArray, terms: Sequence[ZernikeIndex],
+    disc: Aperture, *, weights: FloatArray | None = None, effects: FloatArray | None = None,
+    condition: float = _WORST_CONDITION, strip: RimStrip | None = None,
     sums: tuple[FloatArray, FloatArray] | None = None,
-) -> ZernikeFit:
+) -> ZernikeFit:  # fmt: skip
     """Fit ``terms`` to ``deviation`` [m] at x, y [m] of the part, each (n,), by least squares.
 
     weights: area of each point (n,), None for equal weights
@@ -273,13 +266,9 @@ def _fading(inwards: FloatArray) -> FloatArray:
 
 
 def normal_equations(
-    x: FloatArray,
-    y: FloatArray,
-    values: FloatArray,
-    terms: Sequence[ZernikeIndex],
-    disc: Aperture,
-    weights: FloatArray | None,
-) -> tuple[FloatArray, FloatArray]:
+    x: FloatArray, y: FloatArray, values: FloatArray, terms: Sequence[ZernikeIndex],
+    disc: Aperture, weights: FloatArray | None,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Return the weighted products of the ``terms`` (k, k), and with the ``values`` (k, v)."""
     gram, right = np.zeros((len(terms), len(terms))), np.zeros((len(terms), len(values)))
     for begin in range(0, len(x), CHUNK):

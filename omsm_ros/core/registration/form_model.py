@@ -190,13 +190,9 @@ class Estimate(NamedTuple):
 
 
 def estimate(
-    gram: FloatArray,
-    moments: FloatArray,
-    variance: float,
-    largest: float,
-    group: IntArray,
+    gram: FloatArray, moments: FloatArray, variance: float, largest: float, group: IntArray,
     expected: tuple[FloatArray, FloatArray],
-) -> Estimate:
+) -> Estimate:  # fmt: skip
     """Return the estimate from the normal equations of columns [J, Z].
 
     gram: (p + k, p + k);  moments: columns times data (p + k,) [m]

@@ -94,11 +94,9 @@ def parse_dofs(text: str) -> tuple[str, ...]:
 
 
 def determined_dofs(
-    asked: Sequence[str],
-    gram: FloatArray,
-    points: int,
+    asked: Sequence[str], gram: FloatArray, points: int,
     declared: Mapping[str, float] = MappingProxyType({}),
-) -> PoseParameters:
+) -> PoseParameters:  # fmt: skip
     """Return which of the pose parameters ``asked`` for the surface determines.
 
     asked: names, or "auto" for all rigid ones that are determined, alone or with "power"
@@ -125,12 +123,9 @@ def determined_dofs(
 
 
 def weakest_dof(
-    dofs: PoseParameters,
-    asked: Sequence[str],
-    values: FloatArray,
-    covariance: FloatArray,
+    dofs: PoseParameters, asked: Sequence[str], values: FloatArray, covariance: FloatArray,
     gram: FloatArray,
-) -> tuple[str, Notice] | None:
+) -> tuple[str, Notice] | None:  # fmt: skip
     """Return the least supported move and the reason to hold it at its nominal value, or None.
 
     The odds that the part was moved, against a part at its nominal place, are the ratio of the
@@ -325,12 +320,9 @@ class OpenUncertainty(NamedTuple):
     held: FloatArray = np.empty((0, 0))
 
     def by_source(
-        self,
-        names: Sequence[str],
-        covariance: FloatArray,
-        sources: Sequence[str],
+        self, names: Sequence[str], covariance: FloatArray, sources: Sequence[str],
         moved: FloatArray,
-    ) -> dict[str, FloatArray]:
+    ) -> dict[str, FloatArray]:  # fmt: skip
         """Return the standard uncertainties (p,) of the fitted ``names`` by error source.
 
         covariance: from noise and form (p, p)

@@ -69,12 +69,9 @@ SHARE_OF_SPREAD, _SETTLED_M = 1e-2, 1e-10
 
 
 def coarse_placement(
-    surface: Surface,
-    chosen: PointBatch,
-    names: Sequence[str],
-    aperture: Aperture | None,
+    surface: Surface, chosen: PointBatch, names: Sequence[str], aperture: Aperture | None,
     at: Placement,
-) -> Placement:
+) -> Placement:  # fmt: skip
     """Return the least-squares placement without outliers, the start of the fit with form."""
     for turn in range(_MOST_TURNS):
         points = inside_aperture(placed(surface, at, chosen), aperture)
@@ -135,16 +132,10 @@ _SHARE_OF_UNCERTAINTY = 0.1
 
 
 def register(
-    surface: Surface,
-    portions: PointBatches,
-    asked: Sequence[str],
-    *,
-    sources: Sequence[str] = (),
-    aperture: Aperture | None = None,
-    even: bool = False,
-    dust: DustRule = ISOLATED,
+    surface: Surface, portions: PointBatches, asked: Sequence[str], *, sources: Sequence[str] = (),
+    aperture: Aperture | None = None, even: bool = False, dust: DustRule = ISOLATED,
     declared: Mapping[str, float] = MappingProxyType({}),
-) -> Registration:
+) -> Registration:  # fmt: skip
     """Fit the pose parameters ``asked`` for, or "auto", of a part to its nominal ``surface``.
 
     portions: reads the points;  sources: names of their ``systematic`` rows
@@ -210,13 +201,9 @@ def _about(vertex: FloatArray, portion: PointBatch) -> PointBatch:
 
 
 def _determined(
-    surface: Surface,
-    chosen: PointBatch,
-    asked: Sequence[str],
-    aperture: Aperture | None,
-    at: Placement,
-    declared: Mapping[str, float],
-) -> PoseParameters:
+    surface: Surface, chosen: PointBatch, asked: Sequence[str], aperture: Aperture | None,
+    at: Placement, declared: Mapping[str, float],
+) -> PoseParameters:  # fmt: skip
     """Return which pose parameters the surface determines where the part is ``at``.
 
     Points on an untilted surface decide, because on a tilted one all rotations and shifts mix.
@@ -244,12 +231,9 @@ class _PlacementState(NamedTuple):
 
 
 def _useful(
-    fit: _PoseFit,
-    stand: _PlacementState,
-    chosen: PointBatch,
-    asked: Sequence[str],
+    fit: _PoseFit, stand: _PlacementState, chosen: PointBatch, asked: Sequence[str],
     open_: OpenUncertainty,
-) -> tuple[_PoseFit, _PlacementState, OpenUncertainty]:
+) -> tuple[_PoseFit, _PlacementState, OpenUncertainty]:  # fmt: skip
     """Hold the moves that were not asked for by name and that the points hardly determine."""
     first, names = stand, fit.dofs.fitted
     while True:
@@ -319,13 +303,9 @@ class _PoseFit:
         return found
 
     def sums(
-        self,
-        stand: _PlacementState,
-        portion: PointBatch,
-        held_effects: FloatArray,
-        sums: FormNormalEquations,
-        far: FarPoints | None = None,
-    ) -> PointBatch:
+        self, stand: _PlacementState, portion: PointBatch, held_effects: FloatArray,
+        sums: FormNormalEquations, far: FarPoints | None = None,
+    ) -> PointBatch:  # fmt: skip
         """Add the points of a ``portion`` to ``sums``, with residuals from the free fit.
 
         Returns those beyond the outlier limit; with ``far`` they are recorded there and not added.
@@ -409,14 +389,9 @@ class _PoseFit:
 
 
 def _over_all(
-    fit: _PoseFit,
-    stand: _PlacementState,
-    portions: PointBatches,
-    sources: Sequence[str],
-    open_: OpenUncertainty,
-    dust: DustRule,
-    disc: Aperture,
-) -> Registration:
+    fit: _PoseFit, stand: _PlacementState, portions: PointBatches, sources: Sequence[str],
+    open_: OpenUncertainty, dust: DustRule, disc: Aperture,
+) -> Registration:  # fmt: skip
     """Return the registration from one pass over all points, in which dust comes last."""
     free, held = len(fit.dofs.fitted), root_of(open_.held)
     sums = FormNormalEquations(free + len(fit.basis), len(sources) + 2 * len(held))

@@ -70,13 +70,9 @@ def deviation(x: FloatArray, y: FloatArray, height: FloatArray, nominal: Surface
 
 
 def level(
-    x: FloatArray,
-    y: FloatArray,
-    deviation: FloatArray,
-    *,
-    tilt: bool = False,
+    x: FloatArray, y: FloatArray, deviation: FloatArray, *, tilt: bool = False,
     weights: FloatArray | None = None,
-) -> FloatArray:
+) -> FloatArray:  # fmt: skip
     """Return the deviation (n,) [m] minus its least-squares piston and, with ``tilt``, its tilt.
 
     The piston is the unknown stand-off of the probe; the tilt is the seat of the part on the
@@ -156,14 +152,9 @@ class RunningStatistics:
 
 
 def line_profile(
-    x: FloatArray,
-    y: FloatArray,
-    deviation: FloatArray,
-    *,
-    angle: float = 0.0,
-    half_width: float,
+    x: FloatArray, y: FloatArray, deviation: FloatArray, *, angle: float = 0.0, half_width: float,
     spacing: float,
-) -> Profile:
+) -> Profile:  # fmt: skip
     """Return the profile through the origin at ``angle`` [rad] from x: 0 is along x, π/2 along y.
 
     Points within ``half_width`` [m] of the line are averaged over every ``spacing`` [m].

@@ -59,14 +59,9 @@ class MeasuredPoints:
 
 
 def measured(
-    x: FloatArray,
-    y: FloatArray,
-    height: FloatArray,
-    uncertainty: FloatArray | None = None,
-    notes: tuple[str, ...] = (),
-    *,
-    sample: NDArray[Any] | None = None,
-) -> MeasuredPoints:
+    x: FloatArray, y: FloatArray, height: FloatArray, uncertainty: FloatArray | None = None,
+    notes: tuple[str, ...] = (), *, sample: NDArray[Any] | None = None,
+) -> MeasuredPoints:  # fmt: skip
     """Return the points (n,) [m] that have a position and a height; others count as missing."""
     with np.errstate(invalid="ignore"):  # a signalling NaN of single precision is a NaN too
         x, y, height = (np.ascontiguousarray(v, np.float64) for v in (x, y, height))

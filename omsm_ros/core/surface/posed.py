@@ -136,12 +136,9 @@ class OffAxisSection:
 
 
 def _intersected(
-    surface: Surface,
-    rotation: FloatArray,
-    x: FloatArray,
-    y: FloatArray,
+    surface: Surface, rotation: FloatArray, x: FloatArray, y: FloatArray,
     centre: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Return x and y in the frame of the surface, and the height z in the rotated frame, over x, y.
 
     rotation: R;  centre: of the rotated frame on the surface (3,) [m], its origin if None

@@ -6,8 +6,8 @@ from soaked import always
 
 from omsm_ros.core.form.analyse import ZERNIKES, optical_terms
 from omsm_ros.core.form.deviation_map import DeviationMap
-from omsm_ros.core.form.part_extents import Gaps, extents_of_parts
-from omsm_ros.core.form.part_figures import SmoothTerms, rms_of_part
+from omsm_ros.core.form.part_extents import extents_of_parts
+from omsm_ros.core.form.part_figures import Gaps, SmoothTerms, rms_of_part
 from omsm_ros.core.form.zernike_fit import RimStrip, fit_zernikes
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.area_weights import area_weights
@@ -279,4 +279,51 @@ def test_undetected_terms_belong_to_the_uncertainty_at_a_corner():
                             effects=np.empty((0, len(x))))  # fmt: skip
         whole = extents_of_parts([map_], outline, gaps_of(map_, outline, R / 60))[0][0]
         off.append((whole.value - np.ptp(form(*everywhere))) / whole.uncertainty)
+    assert np.sqrt(np.mean(np.square(off))) < 1.4
+
+
+def spiral(turns, per_turn):
+    """Return x, y of a spiral whose points of all turns lie on the same ``per_turn`` rays."""
+    share = np.linspace(0, 1, turns * per_turn)
+    return tuple(R * share * f(2 * np.pi * turns * share) for f in (np.cos, np.sin))
+
+
+def test_a_bump_between_two_rays_of_a_spiral_belongs_to_the_figure():
+    """Points of a fast spiral are four turns apart along a turn."""
+    (x, y), outline = spiral(160, 125), Aperture(R)
+    away = x + 1j * y - 0.55 * R * np.exp(2j * np.pi * 0.75 / 125)
+    form = 300e-9 * np.exp(-((np.abs(away) / (0.02 * R)) ** 2)) + 20e-9 * (x**2 - y**2) / R**2
+    noise = np.random.default_rng(0).normal(0, 1e-9, len(x))
+    map_ = DeviationMap(x=x, y=y, deviation=form + noise, noise=1e-9,
+                        area=area_weights(x, y, outline=outline),
+                        effects=np.empty((0, len(x))))  # fmt: skip
+    spacing = R * np.sqrt(np.pi / len(x))
+    whole = extents_of_parts([map_], outline, gaps_of(map_, outline, spacing))[0][0]
+    # The summit lies on the hillside of the saddle.
+    true = 300e-9 + 20e-9 * (0.55**2 + 1)
+    assert abs(whole.value - true) <= 2 * whole.uncertainty
+    assert whole.uncertainty < 0.2 * true
+
+
+def test_waves_are_continued_to_the_rim_with_their_noise():
+    """Plane waves of 60 nm cross the rim of a spiral, highest where the last turn has no point."""
+    (x, y), outline, off, noise = spiral(120, 250), Aperture(R), [], 1e-9
+    rim = R * np.exp(2j * np.pi * np.linspace(0, 1, 3600))
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        wave = 2 * np.pi * np.exp(1j * rng.uniform(0, 2 * np.pi)) / rng.uniform(0.2, 0.3) / R
+        phase = rng.uniform(0, 2 * np.pi)
+
+        def form(z, wave=wave, phase=phase):
+            """Return waves that grow outwards, so that the highest place is at the rim."""
+            return 60e-9 * (np.abs(z) / R) ** 6 * np.cos((z * np.conj(wave)).real + phase)
+
+        deviation = form(x + 1j * y) + rng.normal(0, noise, len(x))
+        map_ = DeviationMap(x=x, y=y, deviation=deviation, noise=noise,
+                            area=area_weights(x, y, outline=outline),
+                            effects=np.empty((0, len(x))))  # fmt: skip
+        spacing = R * np.sqrt(np.pi / len(x))
+        whole = extents_of_parts([map_], outline, gaps_of(map_, outline, spacing))[0][0]
+        off.append((whole.value - np.ptp(form(rim))) / whole.uncertainty)
+        assert whole.uncertainty < 4 * noise + 0.5e-9
     assert np.sqrt(np.mean(np.square(off))) < 1.4
