@@ -187,6 +187,7 @@ def adjust(
     views = [view_of(s, k, zero, surface) for k, s in enumerate(scans)]
     views, dust, first = _without_dust(scans, views, priors)
     detecting, refutations, doubts = _with_its_play(first, views, priors)
+    del first  # Its normal equations have 100 MiB.
     solution, families = completed(detecting, refutations), detecting.network.families
     made = FormOf.of(solution, surface, removed)
     effects = effects_on_form(made)
@@ -198,10 +199,12 @@ def adjust(
     wrong = _wrong_signs(views)
     enough, stated = redundant(scans), {p.name for p in priors}
     walk, least = _walk(detecting, priors), MODEL_SHARE * form.rms.value
+    # What the form merely looks like excuses no source that nobody evaluated.
+    known = np.sqrt(form.mean_uncertainty**2 - sum(size**2 for _, size in form.resembled))
     reasons = reasons_of(refutations, stated, agreement, wrong, walk, accepted, least)
     verdict = verdict_of(
         _or_sense_of_c(reasons, scans, priors, surface, refutations),
-        not_evaluated(families, effects, priors, accuracy)
+        not_evaluated(families, effects, priors, accuracy, 2 * known)
         + looks_like(form.resembled, families, accepted, open_limit(accuracy)),
         rests_on(families, effects, form.mean_uncertainty, _mirrored(scans, surface, form)),
         enough, 2 * form.pv.uncertainty, accuracy,

@@ -97,15 +97,9 @@ class Network:
         member = sparse.csr_array(
             (np.ones(number), (self.part.cell, np.arange(number))), shape=(self.part.cells, number)
         )
-        for name, value in {
-            "place": place,
-            "terms": slice(begin, end),
-            "knots": knots,
-            "steps": steps,
-            "_values": values,
-            "_hats": hats,
-            "_member": member,
-        }.items():
+        made = {"place": place, "terms": slice(begin, end), "knots": knots, "steps": steps,
+                "_values": values, "_hats": hats, "_member": member}  # fmt: skip
+        for name, value in made.items():
             object.__setattr__(self, name, value)
 
     @property

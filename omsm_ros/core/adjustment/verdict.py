@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from omsm_ros.core.adjustment.agreement import ScanAgreement
-from omsm_ros.core.adjustment.families import RECLOCKED
+from omsm_ros.core.adjustment.families import BEYOND_CENTRE, RECLOCKED, REFERENCE
 from omsm_ros.core.adjustment.figures import NO_EFFECT, Effect
 from omsm_ros.core.adjustment.refutation import Refutation
 from omsm_ros.core.adjustment.scan_data import ScanData
@@ -159,15 +159,17 @@ def not_evaluated(
     effects: Mapping[str, Effect],
     priors: Sequence[Source],
     accuracy: float | None,
+    expanded: float,
 ) -> tuple[Reason, ...]:
     """Return families that nobody evaluated, that these scans leave open, and that may matter.
 
     effects: of each family on the form, left by scans and prior and by the scans alone, k = 1 [m]
-    accuracy: of PV, asked for [m]; None: none
+    accuracy: of PV, asked for [m]; None: none;  expanded: uncertainty of the heights, rms [m]
 
     What nobody declared counts in the uncertainty with the probability that it is there, so that
-    its heights matter from :func:`open_limit` on. What is declared counts with its declaration:
-    without an evaluation it must not hold where PV (k = 2) could be off by the accuracy.
+    its heights matter from :func:`open_limit` on; from ``expanded`` on where no other speed,
+    direction or clocking would show it. What is declared counts with its declaration: without an
+    evaluation it must not hold where PV (k = 2) could be off by the accuracy.
     The second name of a reason is the scan or artefact that would show the family.
     """
     stated = {base_name(p.name): p for p in priors}
@@ -182,8 +184,9 @@ def not_evaluated(
             continue
         if prior and 2 * effect.peak > of_pv:
             found.append(Reason(DECLARED_ONLY, names, 2 * effect.peak, of_pv))
-        elif prior is None and family.named and effect.free > limit:
-            found.append(Reason(NOT_EVALUATED, names, effect.free, limit))
+        least = min(limit, expanded) if family.shown_by in (BEYOND_CENTRE, REFERENCE) else limit
+        if prior is None and family.named and effect.free > least:
+            found.append(Reason(NOT_EVALUATED, names, effect.free, float(least)))
     return tuple(found)
 
 

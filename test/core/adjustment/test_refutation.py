@@ -217,6 +217,15 @@ def test_what_spirals_to_the_centre_cannot_show_rests_on_its_declaration():
     assert shown["pitch"] == REFERENCE
 
 
+def test_heights_rest_on_no_slide_that_nobody_evaluated():
+    """A micrometre of bow of Z would change them by 7 nm, more than their U of 6."""
+    _, made = drawn(0, 2, pitch=0.8e-3)
+    priors = [p for p in AS_DRAWN if p.name != "straightness_z"]
+    (reason,) = adjust(made, priors, nominal=MIRROR).verdict.reasons
+    assert (reason.code, *reason.names) == ("not_evaluated", "straightness_z", BEYOND_CENTRE)
+    assert 5e-9 < reason.limit < reason.value < 10e-9
+
+
 @pytest.mark.soak
 def test_an_accepted_value_refutes_no_more():
     machine, made = drawn(0, 2, **KINDS["backlash"])
