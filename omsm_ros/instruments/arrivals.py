@@ -18,19 +18,17 @@ from omsm_ros.core.streams.stamps import (
     GROSS_DRIFT,
     LARGEST_CRYSTAL_DRIFT,
     SPAN_S,
-    expected_drift,
+    late_likelihood,
     line_below,
 )
-from omsm_ros.core.streams.statistics import falling_density_likelihood, slopes_below
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.instruments.counting import SteadyMotion
 from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S
 
 # Long enough to average jitter out, short enough to follow a crystal that warms up [s].
 WINDOW_S = 30.0
-# How unlikely the drift of no crystal is beforehand (log), and the time of arrivals that shows it
-# [s], or missed triggers would be taken for one.
-_OTHER_RATE, _OTHER_RATE_S = 12.0, 2.0
+# The drift of no crystal is shown after this time, or missed triggers would be taken for one [s].
+_OTHER_RATE_S = 2.0
 # A clock was set if all arrivals are late, by the first more than usual, for the second time [s].
 _STEP_S, _STEP_AFTER_S = 0.02, 2.0
 # A busy host delays its first arrivals by less than this, so an arrival that is earlier by more
@@ -278,22 +276,37 @@ class _Phases:
 
     A host that polls at its own times sees each age of the last sample equally often. If its polls
     keep step with the trigger, or drift against it no faster than a crystal, the age stays, or
-    changes slowly until it jumps by a whole period. That looks like a missed trigger.
+    changes slowly until it jumps by a whole period. That looks like a missed trigger. With the jump
+    a poll takes a sample more or less, so equal steps before it show polls whose arrivals scatter.
+
+    locked: to the trigger;  ages: so are polls, since not all steps are multiples of a block
     """
 
     def __init__(self, period: float) -> None:
-        self._period = period
+        self._period, self.last = period, 0  # count of the last sample
+        # Greatest common divisor of the counts between arrivals, the first of these, their number.
+        self._block, self._since, self._steps = 0, 0.0, 0
         self._begin, self._lates = -math.inf, list[float]()  # of the current span
         self._means: deque[tuple[complex, ...]] = deque(maxlen=_LATEST)  # [s], 1/n, harmonics
-        self.locked = False
+        self._in_step = self._polled = self._uneven = self.locked = self.ages = False
 
-    def add(self, late: float, arrival: float) -> None:
-        """Enter an arrival;  late: [period];  arrival: [s]."""
+    def add(self, due: float, arrival: float) -> None:
+        """Enter an arrival;  due: count times period [s]."""
+        sample, late = round(due / self._period), (arrival - due) / self._period
+        self._block = math.gcd(self._block, sample - self.last) if self._steps else 0
+        if self._block == 1:
+            lasted = arrival - self._since > self._period / LARGEST_CRYSTAL_DRIFT
+            self._polled |= lasted and self._steps > _CERTAIN / math.log(2)
+            self._steps, self._uneven = 0, True
+        self._since = self._since if self._steps else arrival
+        self._steps, self.last = self._steps + 1, sample
         if arrival - self._begin >= SPAN_S:
             if self._lates:
                 self._end_span(np.array(self._lates))
             self._begin, self._lates = arrival, []
         self._lates.append(late)
+        self.locked = self._in_step or self._polled
+        self.ages = self.locked and self._uneven
 
     def _end_span(self, late: FloatArray) -> None:
         early = late[late < late.min() + _EARLY_PERIODS]  # a delay says nothing of the age
@@ -306,7 +319,7 @@ class _Phases:
         turn = np.exp(-2j * np.pi * np.outer(drifts, since))
         common = [turn**harmonic @ mean for harmonic, mean in zip(_HARMONICS, means, strict=True)]
         limit = min(_LOCKED, _BY_CHANCE * random.mean().real / len(since))
-        self.locked = len(since) > 1 and (np.max(np.abs(common)) / len(since)) ** 2 > limit
+        self._in_step = len(since) > 1 and (np.max(np.abs(common)) / len(since)) ** 2 > limit
 
 
 class _Reference:
@@ -332,7 +345,7 @@ class _Reference:
     def confirms(self, due: float, arrival: float, motion: SteadyMotion) -> bool:
         """Return whether no trigger was missed before this arrival, as far as can be seen."""
         late = arrival - due
-        self._phases.add(late / self._period, arrival)
+        self._phases.add(due, arrival)
         width = _FIRST_S if not self.proven and len(self._earliest) < _FIRST_SPANS else SPAN_S
         before, least = self._earliest[-1] if self._earliest else (-math.inf, 0.0)
         goes_on = arrival - before < width
@@ -349,7 +362,7 @@ class _Reference:
         self.begin = self.begin or arrival
         excess = self.excess(due, arrival)
         # The drift of crystals makes a line uncertain that is not confirmed any more.
-        limit = (_AGE_PERIODS if self._phases.locked else _LATE_PERIODS) * self._period
+        limit = (_AGE_PERIODS if self._phases.ages else _LATE_PERIODS) * self._period
         limit -= 2 * DRIFT_SIGMA * (arrival - self.in_time)
         beyond = self.least_missed > 0 and (excess > limit or limit <= 0)
         # Triggers that are missed regularly are steps of equal size, too, but at a gross drift.
@@ -369,6 +382,7 @@ class _Reference:
     def expect_missed(self, missed: int, since: float) -> None:
         """Expect the arrivals since ``since`` [s] earlier, because triggers were missed then."""
         ahead = missed * self._period
+        self._phases.last += missed
         self._earliest = [(begin, y - ahead * (begin >= since)) for begin, y in self._earliest]
 
     def excess(self, due: float, arrival: float) -> float:
@@ -445,7 +459,7 @@ class _Reference:
         def shifted(at: int, missed: float, end: int | None = None) -> tuple[float, FloatArray]:
             moved = periods.copy()
             moved[at:end] -= missed
-            return _likelihood(since, moved, self._period)
+            return late_likelihood(since, moved, self._period)
 
         none, rest = shifted(0, 0)
         steps = range(max(first, 1), len(late))
@@ -468,6 +482,7 @@ class _Reference:
         seen = np.max([*likely.values()], axis=0) < -_EXCLUDED
         off = np.flatnonzero(sliding_window_view(rest, _SHOWING).min(axis=1) > _AGE_PERIODS)
         aged = (shifted(first, 1, first + _SHOWING)[0] - none > -_EXCLUDED for first in off)
+        locked &= not self._phases.locked or self._phases.ages
         sure = most < _POSSIBLE and not (locked and any(aged)) and seen[-_OPEN:].any()
         unseen = np.diff(begin)[steps.start - 1 :][:-_OPEN] @ ~seen[:-_OPEN]
         return 0 if sure and unseen <= _UNSEEN * (begin[-1] - begin[0]) else None
@@ -477,20 +492,3 @@ class _Reference:
         begin, late = np.array(self._earliest[:known]).T
         least, drift, _ = line_below(begin - begin[-1], late)
         self._line = (least - drift * float(begin[-1]), drift)
-
-
-def _likelihood(x: FloatArray, y: FloatArray, period: float) -> tuple[float, FloatArray]:
-    """Return the log likelihood of arrivals above the likeliest line, and their rests (n,).
-
-    x: times [s];  y: lateness [period], (n,)
-
-    Long delays are rarer than short ones. The two arrivals that define the line do not count.
-    """
-    drift, uncertainty = (each / period for each in expected_drift(x, y * period))
-    slopes = np.append(slopes_below(x, y), drift)
-    rests = y - slopes[:, np.newaxis] * x
-    rests -= rests.min(axis=1, keepdims=True)
-    likely = falling_density_likelihood(np.sort(rests, axis=1)[:, 2:])
-    likely -= ((slopes - drift) / uncertainty) ** 2 / 2
-    best = int(np.argmax(likely))
-    return float(likely[best]) - (_OTHER_RATE if drift else 0.0), rests[best]

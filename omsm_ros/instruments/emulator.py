@@ -225,23 +225,20 @@ class Instrument:
         else:
             last = (self._taken + count) * true_period
         seconds = last - np.arange(count)[::-1] * true_period
-        ticks: np.ndarray = np.rint(seconds * NANOSECONDS_PER_S).astype(np.int64)
-        return ticks
+        return np.asarray(np.rint(seconds * NANOSECONDS_PER_S), np.int64)
 
     def _spoil(self, packed: list[bytes]) -> list[bytes]:
-        pieces: list[bytes] = []
-        dropped, noisy, flipped = (
-            self._struck(rate, len(packed))
-            for rate in (self.faults.drop_rate, self.faults.noise_rate, self.faults.flip_rate)
-        )
-        for i, piece in enumerate(packed):
-            if piece and dropped[i]:
+        pieces, faults = list[bytes](), self.faults
+        rates = faults.drop_rate, faults.noise_rate, faults.flip_rate
+        struck = [self._struck(rate, len(packed)) for rate in rates]
+        for piece, dropped, noisy, flipped in zip(packed, *struck, strict=True):
+            if piece and dropped:
                 continue
-            if piece and flipped[i]:
+            if piece and flipped:
                 damaged = bytearray(piece)
                 damaged[self._random.integers(len(piece))] ^= 1 << int(self._random.integers(8))
                 piece = bytes(damaged)
-            if piece and noisy[i]:
+            if piece and noisy:
                 piece = self._random.bytes(_NOISE_BYTES) + piece
             pieces.append(piece)
         return pieces

@@ -297,12 +297,11 @@ class StreamDevice:
 
     def _listen_in(self, silent: float) -> None:
         """Raise DeviceError if the device is gone or not understood, after ``silent`` [s]."""
-        unread = self._unread
-        if silent > UNREADABLE_S and unread:
+        if silent > UNREADABLE_S and self._unread:
             described = f"{self.described_by}, " if self.described_by else ""
             raise NoSamplesError(
-                f"{self._transport.name} sends bytes ({unread} in {silent:.1f} s), but no samples "
-                f"of this device; check {described}the baud rate and what is connected"
+                f"{self._transport.name} sends bytes ({self._unread} in {silent:.1f} s), but no "
+                f"samples of this device; check {described}the baud rate and what is connected"
             )
 
     def _read_answer(self, said: bytes, unanswered: Callable[[bytes], DeviceError]) -> bytes:

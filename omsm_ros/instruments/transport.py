@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 from urllib.parse import SplitResult, urlsplit
 
 import serial
@@ -125,6 +125,13 @@ _ANSWER_POLL_S = 0.05
 _QUIET_S, _GREETING_S = 0.1, 1.0
 # Bounds the memory of an answer without its end.
 _MAX_ANSWER_BYTES = 65_536
+_Connection = TypeVar("_Connection", serial.Serial, socket.socket)
+
+
+def _opened(connection: _Connection | None, name: str) -> _Connection:
+    if connection is None:
+        raise DeviceError(f"{name!r} is not open; call open() first")
+    return connection
 
 
 class SerialTransport:
@@ -155,7 +162,7 @@ class SerialTransport:
             ) from err
 
     def read(self, timeout: float) -> bytes:
-        port = self._connected()
+        port = _opened(self._port, self.name)
         try:
             if port.timeout != timeout:
                 port.timeout = timeout  # costs a system call, so only when it changes
@@ -165,7 +172,7 @@ class SerialTransport:
             raise self._lost(err) from err
 
     def write(self, data: bytes) -> None:
-        port = self._connected()
+        port = _opened(self._port, self.name)
         try:
             port.write(data)
         except (OSError, termios.error) as err:
@@ -175,11 +182,6 @@ class SerialTransport:
         if self._port is not None:
             self._port.close()
             self._port = None
-
-    def _connected(self) -> serial.Serial:
-        if self._port is None:
-            raise DeviceError(f"serial port {self.name!r} is not open; call open() first")
-        return self._port
 
     def _lost(self, err: Exception) -> DeviceError:
         return DeviceError(
@@ -228,7 +230,7 @@ class TcpTransport:
         self._socket = connection
 
     def read(self, timeout: float) -> bytes:
-        connection = self._connected()
+        connection = _opened(self._socket, self.name)
         try:
             connection.settimeout(timeout)
             data, notes, *_ = connection.recvmsg(_CHUNK_BYTES, socket.CMSG_SPACE(_TIMESPEC.size))
@@ -250,7 +252,7 @@ class TcpTransport:
         return data or b""
 
     def write(self, data: bytes) -> None:
-        connection = self._connected()
+        connection = _opened(self._socket, self.name)
         try:
             connection.settimeout(self._connect_timeout)
             connection.sendall(data)
@@ -261,11 +263,6 @@ class TcpTransport:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
-
-    def _connected(self) -> socket.socket:
-        if self._socket is None:
-            raise DeviceError(f"{self.name!r} is not open; call open() first")
-        return self._socket
 
     def _lost(self, reason: str) -> DeviceError:
         return DeviceError(
@@ -341,14 +338,10 @@ def transport_for(address: str, baud_rate: int = DEFAULT_BAUD_RATE) -> Transport
         if not (host and port.isdecimal()):
             raise ConfigurationError(f"address {address!r}, expected tcp://host:port")
         return TcpTransport(host.strip("[]"), int(port))
-    if address.startswith(ADS_SCHEME):
-        from omsm_ros.instruments.six_channel.latches import AdsRing
+    if address.startswith((ADS_SCHEME, PANDA_SCHEME)):
+        from omsm_ros.instruments.six_channel.latches import AdsRing, PandaBox
 
-        return AdsRing(address)
-    if address.startswith(PANDA_SCHEME):
-        from omsm_ros.instruments.six_channel.latches import PandaBox
-
-        return PandaBox(address)
+        return AdsRing(address) if address.startswith(ADS_SCHEME) else PandaBox(address)
     if address.startswith(_SERIAL_SCHEME):
         path, _, query = address[len(_SERIAL_SCHEME) :].partition("?")
         name, _, value = query.partition("=")

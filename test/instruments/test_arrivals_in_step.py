@@ -44,6 +44,54 @@ def test_nor_are_polls_in_step_whose_arrivals_scatter_by_half_a_period(seed: int
         assert detector.forget_missed() == 0
 
 
+@pytest.mark.parametrize("scatter", ["uniform", "exponential"])
+@pytest.mark.parametrize("seed", range(3))
+def test_nor_are_those_whose_arrivals_scatter_by_a_whole_period(seed: int, scatter: str) -> None:
+    """Their phases are random, but the polls take the same number of samples for seconds."""
+    random, period = np.random.default_rng(seed), 5e-4
+    detector, confirmed = MissedTriggerDetector(period), 0.0
+    polls = np.arange(1, 1200) * 10 * period * (1 - random.uniform(0.7e-4, 1.3e-4))
+    polls += random.uniform(0.5, 1.0) * period
+    late = getattr(random, scatter)(*((0.0, period) if scatter == "uniform" else (period,)), 1199)
+    for poll, arrival in zip(polls, np.maximum.accumulate(polls + late), strict=True):
+        due = math.floor(poll / period) * period
+        confirmed += detector.confirms(due, UPTIME_S + float(arrival))
+        assert detector.forget_missed() == 0
+    assert confirmed
+
+
+def blocks_in_slices(seed: int, missed_at: float = math.inf) -> tuple[list[float], list[float]]:
+    """Return when the blocks of 50 samples that are confirmed, and all, were complete [s].
+
+    The device sends each block at once. The host runs for 10 ms and rests for 30 ms on average.
+    """
+    random, detector, blocks = np.random.default_rng(seed), MissedTriggerDetector(PERIOD), 160
+    slices = np.cumsum(random.exponential((0.03, 0.01), (1000, 2)).ravel()).reshape(-1, 2)
+    taken = np.arange(1, blocks + 1) * 50 * PERIOD
+    taken += PERIOD * (taken > missed_at)
+    sent = taken * (1 + 2e-5) + random.exponential(3e-5, blocks)
+    begun = slices[np.searchsorted(slices[:, 1], sent), 0]
+    arrivals = np.maximum.accumulate(np.maximum(sent, begun) + random.exponential(2e-5, blocks))
+    last = np.flatnonzero(np.diff(arrivals, append=np.inf) > 1e-4)  # of those read together
+    confirmed = [
+        detector.confirms((int(block) + 1) * 50 * PERIOD, UPTIME_S + float(arrivals[block]))
+        for block in last
+    ]
+    return taken[last[confirmed]].tolist(), taken[last].tolist()
+
+
+def test_blocks_are_confirmed_on_a_busy_host_that_delays_most_of_them() -> None:
+    """A poll would take a sample more or less now and then, so their age stays."""
+    begun = [min(blocks_in_slices(seed)[0], default=math.inf) for seed in range(6)]
+    assert np.median(begun) < 5.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nor_is_a_block_after_a_missed_trigger(seed: int) -> None:
+    confirmed, taken = blocks_in_slices(seed, missed_at=6.01)
+    assert max(confirmed, default=0.0) < 6.01 < max(taken)
+
+
 def test_a_missed_trigger_is_seen_on_a_grid_of_half_a_period() -> None:
     """A USB frame of 1 ms becomes early enough for the age of a 500 Hz trigger when one is missed.
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omsm_ros.core.streams.blocks import Block, FloatArray, IntArray
-from omsm_ros.core.streams.statistics import slopes_below
+from omsm_ros.core.streams.statistics import falling_density_likelihood, slopes_below
 from omsm_ros.errors import DataError, Notice
 from omsm_ros.units import NANOSECONDS_PER_S, PPM
 
@@ -264,6 +264,8 @@ _LEAST_POINTS, _SURE_POINTS = 6, 9
 GROSS_DRIFT = 0.1
 # Delays below this are those of the clocks themselves [s].
 _LEAST_DELAY_S = 1e-6
+# How unlikely the drift of no crystal is beforehand (log).
+_OTHER_RATE = 12.0
 
 
 def line_below(x: FloatArray, y: FloatArray) -> tuple[float, float, FloatArray]:
@@ -296,3 +298,20 @@ def expected_drift(x: FloatArray, y: FloatArray) -> tuple[float, float]:
         if abs(drift) - range_ > least:
             return drift, range_
     return 0.0, DRIFT_SIGMA
+
+
+def late_likelihood(x: FloatArray, y: FloatArray, period: float) -> tuple[float, FloatArray]:
+    """Return the log likelihood of arrivals above the likeliest line, and their rests (n,).
+
+    x: times [s];  y: lateness [period], (n,)
+
+    Long delays are rarer than short ones. The two arrivals that define the line do not count.
+    """
+    drift, uncertainty = (each / period for each in expected_drift(x, y * period))
+    slopes = np.append(slopes_below(x, y), drift)
+    rests = y - slopes[:, np.newaxis] * x
+    rests -= rests.min(axis=1, keepdims=True)
+    likely = falling_density_likelihood(np.sort(rests, axis=1)[:, 2:])
+    likely -= ((slopes - drift) / uncertainty) ** 2 / 2
+    best = int(np.argmax(likely))
+    return float(likely[best]) - (_OTHER_RATE if drift else 0.0), rests[best]

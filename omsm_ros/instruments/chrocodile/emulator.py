@@ -205,9 +205,7 @@ class ChrocodileEmulator(Instrument):
             return times_ns % 2**32
         if number == FLAGS:
             return np.where(measured.status == Status.SATURATED, SATURATED, 0)
-        if number == SAMPLE_COUNTER:
-            return counters
-        return np.zeros(len(measured))
+        return counters if number == SAMPLE_COUNTER else np.zeros(len(measured))
 
 
 # Samples in a packet.

@@ -380,27 +380,22 @@ def _check_not_silent(name: str, settings: ControllerSettings, silent: float) ->
 
 def make_serial(values: Values, transport: Transport, now_ns: NowNs) -> ConfocalDtDevice:
     """Return the device that ``values`` describe, over RS-422."""
-    settings = ConfocalDtSettings(
-        **block_settings(values),
-        probe=probe_reading_of(values),
-        values=tuple(values["signals"].replace(",", " ").split()) or ("distance",),
-        trigger=values["trigger"],
-    )
-    return ConfocalDtDevice(transport, settings, now_ns)
+    signals = tuple(values["signals"].replace(",", " ").split()) or ("distance",)
+    return ConfocalDtDevice(transport, _settings(values, values=signals), now_ns)
 
 
 def make_ethernet(values: Values, transport: Transport, now_ns: NowNs) -> ConfocalDtEthernetDevice:
     """Return the device that ``values`` describe, over Ethernet."""
     wired = values["encoders"].lower()
-    settings = ConfocalDtSettings(
-        **block_settings(values),
-        probe=probe_reading_of(values),
-        axes=tuple(axes_of(values, wired).values()) if wired else None,
-        wired=_wired(values["encoders"]),
-        trigger=values["trigger"],
-    )
+    axes = tuple(axes_of(values, wired).values()) if wired else None
+    settings = _settings(values, axes=axes, wired=_wired(values["encoders"]))
     commands = command_transport(values["port"], values["command_port"])
     return ConfocalDtEthernetDevice(transport, settings, now_ns, commands=commands)
+
+
+def _settings(given: Values, **more: Any) -> ConfocalDtSettings:
+    common = block_settings(given) | {"trigger": given["trigger"]}
+    return ConfocalDtSettings(**common, probe=probe_reading_of(given), **more)
 
 
 def _wired(text: str) -> tuple[int, ...]:
