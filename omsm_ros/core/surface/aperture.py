@@ -17,8 +17,8 @@ from omsm_ros.quantities import LENGTH
 Outline = Literal["disc", "annulus", "ellipse", "rectangle", "polygon"]
 # Points on the rim are inside although float32 rounds them.
 _RIM = 1 + 1e-6
-# Points of a drawn rim. Nodes of Gauss along the radius, exact for squares of order 8 and more.
-_DRAWN, _NODES = 181, 16
+# Points of a drawn rim. Nodes of Gauss along the radius, exact for order 8; across a polygon.
+_DRAWN, _NODES, _ACROSS = 181, 16, 256
 # Cells that show gaps; the widest gap that is covered, in tracks, and at least in cells.
 _CELLS_ACROSS, _GAP_IN_TRACKS, _LEAST_CELLS = 512, 3.5, 3.0
 # Share of the points that an outline holds within a track of its rim. An ellipse holds 79 % of a
@@ -133,9 +133,13 @@ class Aperture:
         return np.asarray(middle + np.concatenate([self.radius * turn, hole], axis=1))
 
     def nodes(self) -> FloatArray:
-        """Return x, y [m] and areas [m²] that make integrals (3, n); a polygon has none."""
+        """Return x, y [m] and areas [m²] that make integrals (3, n), of a polygon to 1e-3."""
         if self.outline == "polygon":
-            return np.empty((3, 0))
+            # Turned, because sides are often along x or y.
+            at, cell = (2 * np.arange(_ACROSS) + 1) / _ACROSS - 1, (2 * self.radius / _ACROSS) ** 2
+            place = self.radius * np.exp(0.5j) * np.add.outer(at, 1j * at).ravel()
+            nodes = np.stack([self.x + place.real, self.y + place.imag, np.full(len(place), cell)])
+            return nodes[:, self.holds(*nodes[:2])]
         at, share = np.polynomial.legendre.leggauss(_NODES)
         a, b = self.sizes if self.outline in ("ellipse", "rectangle") else (self.radius,) * 2
         if self.outline == "rectangle":

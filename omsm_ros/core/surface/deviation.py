@@ -164,7 +164,13 @@ def line_profile(
     along = x * np.cos(angle) + y * np.sin(angle)
     across = y * np.cos(angle) - x * np.sin(angle)
     near = np.abs(across) <= half_width
-    return _averaged(along[near], deviation[..., near], spacing)
+    interval = _intervals(along[near], spacing)
+    filled, index, points = np.unique(interval, return_inverse=True, return_counts=True)
+    return Profile(
+        position=np.bincount(index, along[near], len(filled)) / points,
+        value=_sums(index, deviation[..., near], len(filled)) / points,
+        points=points.astype(np.int64),
+    )
 
 
 def radial_profile(
@@ -191,16 +197,6 @@ def radial_profile(
         position=np.mean(radii[whole] / points[whole], axis=1),
         value=np.mean(values[..., whole, :] / points[whole], axis=-1),
         points=np.sum(points[whole], axis=1).astype(np.int64),
-    )
-
-
-def _averaged(position: FloatArray, value: FloatArray, spacing: float) -> Profile:
-    interval = _intervals(position, spacing)
-    filled, index, points = np.unique(interval, return_inverse=True, return_counts=True)
-    return Profile(
-        position=np.bincount(index, position, len(filled)) / points,
-        value=_sums(index, value, len(filled)) / points,
-        points=points.astype(np.int64),
     )
 
 

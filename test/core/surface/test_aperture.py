@@ -45,7 +45,16 @@ def test_sums_over_nodes_are_integrals(text, area, square):
     assert share @ u**2 == pytest.approx(square, rel=1e-12)
     assert share @ (u**7 * v**8) == pytest.approx(0.0, abs=1e-9)
     assert np.all(outline.holds(x, y))
-    assert Aperture.parse("polygon:0,0,1,0,0,1").nodes().shape == (3, 0)
+
+
+def test_sums_over_nodes_of_a_polygon_are_nearly_integrals():
+    """∫ dA, ∫ x dA and ∫ x² dA of a right triangle in closed form."""
+    triangle = Aperture.parse("polygon:0,0,1,0,0,1")
+    x, y, share = triangle.nodes()
+    np.testing.assert_allclose(
+        share @ np.stack([x**0, x, x**2]).T, [1 / 2, 1 / 6, 1 / 12], rtol=1e-3
+    )
+    assert np.all(triangle.holds(x, y))
 
 
 def test_an_aperture_holds_its_rim_even_in_float32():
