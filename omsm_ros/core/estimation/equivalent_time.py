@@ -85,9 +85,8 @@ def fast_mode(record: MotionRecord) -> FastMode:
         and record.ok[edge.start : edge.stop].any()
     ]
     if len(whole) < _LEAST_EDGES:
-        return FastMode(
-            finding=Notice("estimation.few_edges", edges=len(whole), least=_LEAST_EDGES)
-        )
+        few = Notice("estimation.few_edges", edges=len(whole), least=_LEAST_EDGES)
+        return FastMode(finding=few)
     edges = _normalised(record, whole)
     grid = np.arange(-_BEFORE * _FINE, _AFTER * _FINE) / _FINE
     command, start, misfit = _axis(edges, grid, period)
@@ -191,12 +190,8 @@ class _ProbeFit:
         """
         at = np.clip(self.at - p[0], self.grid[0], self.grid[-1])
         parts = [np.ones(len(at)), np.interp(at, self.grid, self.command)]
-        poles = [complex(-np.exp(p[1]))]
-        if len(p) > 3:
-            poles.append(2 * np.pi * np.exp(p[2]) * complex(-p[3], np.sqrt(1 - p[3] ** 2)))
-        else:
-            poles.append(complex(-np.exp(p[2])))
-        for pole in poles:
+        unit = complex(-p[3], np.sqrt(1 - p[3] ** 2)) * 2 * np.pi if len(p) > 3 else complex(-1.0)
+        for pole in (complex(-np.exp(p[1])), unit * np.exp(p[2])):
             parts += self._through(pole, at)
         columns = np.column_stack(parts)
         return np.asarray(self.seen - columns @ least_squares(columns, self.seen))
@@ -211,10 +206,8 @@ def _mode(
     tried = [np.array([0.0, np.log(a), np.log(f), 0.2]) for f in _MODES_HZ for a in _REAL]
     start = min(tried, key=lambda p: float(np.sum(residual(p) ** 2)))
     low, high = _LATENCIES
-    bounds = (
-        [low, np.log(10.0), np.log(30.0), 1e-3],
-        [high, np.log(1e6), np.log(2.5 / period), 0.98],
-    )
+    least, most = np.log([10.0, 30.0]), np.log([1e6, 2.5 / period])
+    bounds = [low, *least, 1e-3], [high, *most, 0.98]
     best = optimize.least_squares(residual, start, bounds=bounds)
     alone = [[0.0, *np.log(pair)] for pair in combinations(_REAL, 2)]
     without = min(2 * optimize.least_squares(residual, first).cost for first in alone)

@@ -19,7 +19,6 @@ from omsm_ros.core.estimation.covariance import autoregression
 from omsm_ros.core.estimation.impulse_response import coherent_power, gram_of, impulse_response
 from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, ParallelSections
 from omsm_ros.core.estimation.sampled_fit import (
-    RACE,
     RATE,
     SampledRecord,
     SectionsFit,
@@ -29,6 +28,7 @@ from omsm_ros.core.estimation.sampled_fit import (
 from omsm_ros.core.estimation.sampled_model import simulated
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.errors import IdentificationError
+from omsm_ros.linear_algebra import inverse_gram
 
 # Most poles. Orders that are tried: every one while it is low, then steps.
 MAX_ORDER = 40
@@ -61,8 +61,8 @@ _LEAST_SAMPLES_EACH = 3
 _MOST_SAMPLES = 1_000_000
 # Used samples of all records together on which orders are explored.
 EXPLORED_ON = 8000
-# Iterations of an explored, of a refitted and of the final fit.
-_EXPLORING, _REFITTED, _FINAL = 12, 4, 30
+# Iterations of each start, of an explored, of a refitted and of the final fit.
+_RACE, _EXPLORING, _REFITTED, _FINAL = 3, 12, 4, 30
 # Directions weaker than this part of the power of the strongest are rounding of six digits.
 _UNEXCITED = 1e-12
 # The comparator's record: half its sampling rate over the frequency below which this share of the
@@ -114,8 +114,7 @@ def choose_sampled(
     MAX_ORDER.
     """
     most = check_records(records, order)
-    none = np.zeros(records[0].inputs.shape[1], np.int64)
-    whole = SectionsProblem(records, hold, none)
+    whole = SectionsProblem(records, hold, np.zeros(records[0].inputs.shape[1], np.int64))
     if hold != BAND_LIMITED and max_delay:
         parts = replace(whole, records=_exciting_parts(records))
         late = _confirmed(_with_delays(parts, max_delay)[0], min(_CONFIRMING_ORDER, most))
@@ -126,12 +125,13 @@ def choose_sampled(
     records = [replace(r, used=u) for r, u in zip(explored.records, first, strict=True)]
     early = replace(explored, records=records)
     fits, by_order = _explore(early, explored, most, order, lag)
-    orders = [fitted.order for fitted in fits]
+    orders, judged = [fitted.order for fitted in fits], list[SampledCandidate]()
     best = np.argsort(by_order, kind="stable")[:_FINALISTS]
     alike = np.flatnonzero(by_order <= _EQUIVALENT * np.min(by_order))[:_FINALISTS]
-    finalists, judged = {0, 1, order, *(orders[i] for i in (*best, *alike))}, []
-    for fitted in (fitted for fitted in fits if fitted.order in finalists):
-        refitted = explored.fit(fitted.order, [fitted.nonlinear], _EXPLORING)
+    finalists = {0, 1, order, *(orders[i] for i in (*best, *alike))}
+    for fitted in (fitted for fitted in reversed(fits) if fitted.order in finalists):
+        starts = [fitted.nonlinear, *(_reduced(c.fit, fitted.order) for c in judged[:1])]
+        refitted = explored.fit(fitted.order, starts, _EXPLORING)
         judged.append(SampledCandidate(refitted, validation_errors(refitted)))
     free = simplest_undominated(judged)
     chosen = free if not order else next(c for c in judged if c.fit.order == order)
@@ -307,7 +307,7 @@ def _explore(
     late = lag.problem.late(lag.nonlinear, lag.order)
     for order in sorted(n for n in {*_ORDERS, asked} if n <= most):
         starts = _starts(early, fits, best, order, late)
-        raced = [early.fit(order, [start], RACE) for start in starts]
+        raced = [early.fit(order, [start], _RACE) for start in starts]
         chosen = min(raced, key=lambda one: _missed(one, whole))
         fits.append(early.fit(order, [chosen.nonlinear], _EXPLORING))
         missed.append(_missed(fits[-1], whole))
@@ -332,6 +332,22 @@ def _starts(
         own = smaller.problem.late(smaller.nonlinear, smaller.order)
         found += [problem.nonlinear_of(p, own) for p in grown_starts(problem, smaller, order)]
     return found
+
+
+def _reduced(larger: SectionsFit, order: int) -> FloatArray:
+    """Return parameters: ``larger`` without a single pole, and the pairs whose loss costs least."""
+    gram, pairs = larger.gram(), list(range(larger.order // 2))
+    own = np.tile(np.append(-1, np.arange(larger.order) // 2), larger.problem.inputs)
+    while len(pairs) > order // 2:
+        places = np.flatnonzero(np.isin(own, [-1, *pairs]))
+        inverse, cost = inverse_gram(gram[np.ix_(places, places)]), []
+        for lost in (np.flatnonzero(own[places] == pair) for pair in pairs):
+            along = inverse[lost] @ gram[places] @ np.ravel(larger.linear)
+            cost.append(along @ inverse_gram(inverse[np.ix_(lost, lost)]) @ along)
+        pairs.pop(int(np.argmin(cost)))
+    first, second = np.log(larger.sections[pairs].T)
+    single = np.full(order % 2, np.log(RATE / 5))
+    return np.concatenate([first, single, second, larger.nonlinear[larger.order :]])
 
 
 def validation_residual(fitted: SectionsFit, whole: SectionsProblem) -> list[FloatArray]:

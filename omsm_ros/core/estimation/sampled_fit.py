@@ -43,8 +43,8 @@ RATE = 0.5
 _EXCITED = 1e-3
 # Most lines of one record for vector fitting, evenly among the excited ones.
 _MOST_LINES = 4000
-# Iterations of vector fitting: by then it has converged, or will not; of each start in a race.
-_RELOCATIONS, RACE = 10, 3
+# Iterations of vector fitting: by then it has converged, or will not.
+_RELOCATIONS = 10
 # Damping ratio of pairs at a start, those that are tried for a line of the residual, and the lines.
 _START_DAMPING, _ADDED_DAMPINGS, _TRIED_LINES = 0.05, (0.002, 0.01, 0.05), 40
 
@@ -159,6 +159,11 @@ class SectionsFit:
             start += len(one.places)
         return grids
 
+    def gram(self) -> FloatArray:
+        """Return the products of the columns of ``linear``, without the free ones, (q, q)."""
+        own = [_Columns(self.problem, s, self.nonlinear, self.order) for s in self.problem.spectra]
+        return np.asarray(sum(p.rows @ p.rows.T - p.along @ p.along.T for p in own))
+
     def roots(self) -> ComplexArray:
         """Return the poles in w, scaled, (n,)."""
         return self.model().roots() / RATE
@@ -254,17 +259,14 @@ class SectionsProblem:
         return Projection(nonlinear, np.concatenate(left), linear, normal)
 
     def fit(self, order: int, starts: Sequence[FloatArray], evaluations: int = 40) -> SectionsFit:
-        """Improve each of ``starts`` by a few iterations; return the minimum of the best."""
+        """Return the best of the fits that a few iterations reach from ``starts``."""
         box = self.box(order)
 
         def project(nonlinear: FloatArray) -> Projection:
             return self.project(nonlinear, order)
 
-        tried = [project(np.clip(start, *box)) for start in starts]
-        if len(tried) > 1:
-            tried = [descend(project, one, box, RACE) for one in tried]
+        tried = [descend(project, project(np.clip(s, *box)), box, evaluations) for s in starts]
         best = min(tried, key=lambda one: float(one.residual @ one.residual))
-        best = descend(project, best, box, evaluations)
         linear = best.linear.reshape(self.inputs, -1)
         return SectionsFit(self, order, best.nonlinear, linear, best.residual)
 

@@ -344,8 +344,7 @@ def two_mass_model(
             collocated=collocated,
             frequencies=lines,
         )
-        known = bool(np.all(fitted.uncertainty < _GREATEST_UNCERTAINTY))
-        if known and fitted.misfit < _GREATEST_MISFIT:
+        if np.all(fitted.uncertainty < _GREATEST_UNCERTAINTY) and fitted.misfit < _GREATEST_MISFIT:
             return TwoMassModel(
                 table_mass_kg=mass,
                 model=asdict(fitted.model),
@@ -390,14 +389,12 @@ def static_gains(record: MotionRecord) -> StaticGain:
     encoder, probe = _means(record.z, rests), _means(np.asarray(readings), rests)
     further = [_means(motion, rests) for motion in record.further.values()]
     ratio = partial(_ratio, further=further, time=time, part=part)
+    found = StaticGain(probe_per_encoder=ratio(encoder, probe))
     if record.reference is None:
-        return StaticGain(probe_per_encoder=ratio(encoder, probe))
+        return found
     reference = _means(record.reference, rests)
-    return StaticGain(
-        probe_per_encoder=ratio(encoder, probe),
-        probe_per_reference=ratio(reference, probe),
-        reference_per_encoder=ratio(encoder, reference),
-    )
+    found = replace(found, probe_per_reference=ratio(reference, probe))
+    return replace(found, reference_per_encoder=ratio(encoder, reference))
 
 
 def _means(values: FloatArray, rests: list[tuple[int, int]]) -> FloatArray:

@@ -217,11 +217,8 @@ def _blocks(candidate: SampledCandidate, period: float) -> list[_Block]:
         lines = np.flatnonzero(ndimage.binary_dilation(excited, iterations=_LINES // 2))
         residual = np.asarray(np.fft.rfft(grid), np.complex128)
         for part in _neighbours(lines, _LINES + _LINES_PER_INPUT * len(spectra)):
-            found.append(
-                _compared(
-                    frequency[part] / period, driven[:, part], residual[part], powers[:, part]
-                )
-            )
+            at = frequency[part] / period
+            found.append(_compared(at, driven[:, part], residual[part], powers[:, part]))
     return sorted(found, key=lambda block: block.frequency)
 
 
@@ -335,7 +332,7 @@ def _certificate(
     follows: part of the residual that an impulse response makes of the inputs, over the model
     "predicted" is the share of the variance of held-out parts that free runs explain.
     """
-    chosen, limits = choice.chosen, SAMPLED_LIMITS
+    chosen, limits = choice.chosen, {"gain": SAMPLED_LIMITS.gain, "phase_rad": SAMPLED_LIMITS.phase}
     problem, residual = chosen.fit.problem, chosen.fit.residual
     variance = float(np.mean(np.concatenate([one.output for one in problem.spectra]) ** 2)) or 1.0
     predicted, independent = 1 - float(np.mean(chosen.held_out)), _independence(chosen)
@@ -367,11 +364,7 @@ def _certificate(
         "poles": _poles(sections, valid),
         "continuous_error": _continuous_error(sections, valid[0]),
         "samples": {"received": sum(len(r) for r in problem.records), "compared": len(residual)},
-        "limits": {
-            "gain": limits.gain,
-            "phase_rad": limits.phase,
-            "predicted_least": _LEAST_PREDICTED,
-        },
+        "limits": limits | {"predicted_least": _LEAST_PREDICTED},
         "warnings": [str(warning) for warning in warnings],
         "reasons": [str(reason) for reason in reasons],
         "verdict": REJECTED if reasons else str(accepted),
@@ -408,8 +401,7 @@ def _poles(
         elif frequency < low:
             found.append({"slower_than_hz": low})
         else:
-            damping = float(-pole.real / abs(pole))
-            found.append({"frequency_hz": frequency, "damping": damping})
+            found.append({"frequency_hz": frequency, "damping": float(-pole.real / abs(pole))})
     return sorted(found, key=lambda entry: next(iter(entry.values())))
 
 

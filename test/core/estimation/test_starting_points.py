@@ -4,10 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from omsm_ros.core.estimation.model_order import StartingPoints, coarser, fit
 from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.output_error import Problem
+from omsm_ros.core.estimation.sampled_choice import choose_sampled
+from omsm_ros.core.estimation.sampled_fit import SampledRecord
 from omsm_ros.core.lti.modes import known_modes
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 
@@ -115,3 +118,19 @@ def test_what_was_lost_for_longer_than_a_new_sample_stays_lost():
     used[6000:6100] = used[300] = False
     fewer = coarser(replace(problem, used=used), 3)
     assert np.flatnonzero(~fewer.used).tolist() == list(range(2001, 2033))
+
+
+def test_an_order_that_is_asked_for_ends_in_the_least_minimum():
+    """There the residual has less power than the noise; one of four modes is weak."""
+    rng = np.random.default_rng(2)
+    u, y = rng.normal(size=600), np.zeros(600)
+    frequency, damping = rng.uniform(0.03, 0.4, 4), np.exp(rng.uniform(-5.3, -3, 4))
+    for f, d in zip(frequency, damping, strict=True):
+        pole = np.exp(2 * np.pi * f * (-d + 1j * np.sqrt(1 - d * d)))
+        size = rng.choice([-1, 1]) * np.exp(rng.normal(0, 0.8)) * (1 - abs(pole))
+        y += size * signal.lfilter([0, 1], [1, -2 * pole.real, abs(pole) ** 2], u)
+    noise = rng.normal(size=600) * 0.01 * np.std(y)
+    record = SampledRecord(u[:, np.newaxis], y + noise, np.ones(600, bool))
+    chosen = choose_sampled([record], "zero-order", order=8).chosen.fit
+    assert chosen.order == 8
+    assert np.std(chosen.residual) < np.std(noise)
