@@ -5,9 +5,9 @@ about one standard deviation, which no covariance shows. The chosen structure is
 with one parameter more: it trades that bias for variance, which the uncertainty band includes.
 Alternatives that changed nothing are in ``docs/design/identification-ablation.md``.
 
-A fit starts at several points, because the output error has local minima: at the best fit of a
-smaller structure, so that a larger one never fits worse; and at the result of iterated linear least
-squares, which finds resonances.
+A fit starts at two points, because the output error has local minima: at the best fit of a smaller
+structure, so that a larger one never fits worse; and at a fit with two poles fewer, with a mode
+added where it explains most of the rest, which finds resonances.
 """
 
 from __future__ import annotations
@@ -27,15 +27,9 @@ from omsm_ros.core.estimation.optimisation import (
     descend,
 )
 from omsm_ros.core.estimation.output_error import CompressedProblem, Problem
-from omsm_ros.core.lti.transfer_function import (
-    ComplexArray,
-    Structure,
-    TransferFunction,
-    ascending_roots,
-)
+from omsm_ros.core.lti.transfer_function import ComplexArray, Structure, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import IdentificationError
-from omsm_ros.linear_algebra import inverse_gram
 
 # Most poles of the free choice; real machines have needed four in the band of a step test.
 _FREE_POLES = 8
@@ -50,13 +44,13 @@ _CANCELLING = 0.005
 
 
 def structures(poles: int) -> list[Structure]:
-    """Return the structures with ``poles`` and one or two zeros fewer, smallest first.
+    """Return the structures with ``poles`` and at most two zeros fewer, smallest first.
 
-    A mass cannot follow infinitely fast, so there are always fewer zeros than poles.
+    Pairs of poles may have as many zeros: modes beside a motion that is followed as far as seen.
     """
     if poles == 0:
         return [Structure(0, 0, True)]
-    zeros = range(max(poles - 2, 0), poles)
+    zeros = range(max(poles - 2, 0), poles + (poles % 2 == 0))
     every = [Structure(poles, m, delay) for m in zeros for delay in (False, True)]
     return sorted(every, key=lambda structure: (structure.size, structure.delay))
 
@@ -83,12 +77,14 @@ def information(fit: Fit, colour: float = 1.0) -> float:
 def explore(
     fit_structure: Callable[[Structure, Sequence[Fit]], Fit],
     order: int = 0,
-    colour: float = 1.0,
+    colour_of: Callable[[Fit], float] = lambda fit: 1.0,
     budget: EvaluationBudget | None = None,
 ) -> list[Candidate]:
     """Fit structures of rising order until two more poles in a row gain nothing.
 
-    order: number of poles to go to in any case;  colour: of the noise, see :func:`information`
+    order: number of poles to go to in any case
+    colour_of: returns that of the noise that a fit leaves, see :func:`information`; the best of
+        each order tells it anew, because motion that a poor model leaves is no noise
     budget: of the fits; no further order is tried once it is exhausted
 
     Raises IdentificationError for an order out of range.
@@ -96,13 +92,15 @@ def explore(
     if not 0 <= order <= MAX_POLES:
         raise IdentificationError("estimation.order", order=order, most=MAX_POLES)
     found: list[Candidate] = []
-    fruitless = 0
+    fruitless, colour = 0, 1.0
     for poles in range(max(_FREE_POLES, order) + 1):
         before = min((c.bic for c in found), default=np.inf)
         for structure in _promising(poles, found, fit_structure, colour):
             fitted = fit_structure(structure, [c.fit for c in found])
             found.append(Candidate(fitted, information(fitted, colour)))
         fruitless = 0 if min(c.bic for c in found) < before else fruitless + 1
+        colour = colour_of(min((c.fit for c in found), key=lambda fit: fit.sum_of_squares))
+        found = [Candidate(c.fit, information(c.fit, colour)) for c in found]
         if poles < order:
             continue
         if fruitless >= 2 or (poles < _FREE_POLES and budget is not None and budget.stops()):
@@ -135,16 +133,19 @@ def choose(candidates: Sequence[Candidate]) -> Candidate:
     """Return the best structure that contains the best by BIC and has one parameter more.
 
     It has three parameters at least: with fewer, lag and roll-off are not independent. A
-    structure whose zero cancels a pole does not count as larger.
+    structure whose zero cancels a pole does not count as larger, nor one with as many zeros as
+    poles if the best has fewer.
     """
     smallest = min(candidates, key=lambda c: c.bic)
     wanted = max(smallest.fit.structure.size + 1, _LEAST_PARAMETERS)
+    followed = smallest.fit.structure.zeros == smallest.fit.structure.poles > 0
     richer = [
         c
         for c in candidates
         if c.fit.structure.contains(smallest.fit.structure)
         and c.fit.structure.size >= wanted
         and not cancels(c.fit.dynamics)
+        and (followed or c.fit.structure.zeros < c.fit.structure.poles)
     ]
     return min(richer, key=lambda c: (c.fit.structure.size, c.fit.sum_of_squares), default=smallest)
 
@@ -233,10 +234,10 @@ def fit(
 
 # Part of the lag that starts as a delay where there are poles too.
 _KEPT_DELAY = 0.3
-# Iterations after Sanathanan and Koerner (1963): by then they have converged, or will not.
-_LINEAR_ITERATIONS = 8
 # Start of an added pole: fast enough to change little, slow enough to have a gradient.
 _ADDED_POLE = -10.0
+# An added mode, ζ = 0.1, and its frequencies over the bandwidth of the motion.
+_MODE, _MODE_RATES = np.array([-0.1 - 1j, -0.1 + 1j]), np.geomspace(0.1, 10, 10)
 # Half the sampling rate of a decimated problem over the bandwidth of the motion.
 ABOVE_CONTENT = 1.25
 # Anti-alias filter: taps on either side at the new rate, the middle of its edge over half the new
@@ -255,41 +256,32 @@ class StartingPoints:
     pure_delay: Fit
 
     def of(self, structure: Structure, smaller: Sequence[Fit]) -> list[FloatArray]:
-        """Return ψ of ``structure``, given the fits made so far."""
+        """Return ψ of ``structure``, given the fits made so far.
+
+        A mode is added where it explains most of what the best fit with two poles fewer leaves;
+        fast poles, which change little, to the best of all.
+        """
+        contained = sorted(
+            (f for f in smaller if structure.contains(f.structure)), key=lambda f: f.sum_of_squares
+        )
+        mode = _MODE if structure.poles > 1 else -np.abs(_MODE[: structure.poles])
+        fewer = [f for f in contained if 0 < f.structure.poles == structure.poles - len(mode)][:1]
+        starts = [self._start(structure, fewer, rate * mode) for rate in _MODE_RATES]
+        scaled = ScaledStructure(structure, self.problem.rate)
+        left = [self.problem.project(scaled, start).residual for start in starts]
+        found = [starts[int(np.argmin([each @ each for each in left]))]]
+        return found + [self._start(structure, contained[:1], mode[:0])] * bool(contained)
+
+    def _start(self, structure: Structure, base: Sequence[Fit], added: ComplexArray) -> FloatArray:
+        """Return ψ with the poles of the fit in ``base``, if any, ``added`` ones and fast ones."""
         scaled = ScaledStructure(structure, self.problem.rate)
         delay = float(self.pure_delay.nonlinear[-1]) if self.pure_delay.structure.delay else 0.0
-        kept = _KEPT_DELAY * delay if structure.delay else 0.0
-        found = [scaled.nonlinear_of(self._linear(structure, kept), kept)]
-        contained = [f for f in smaller if structure.contains(f.structure)]
-        if contained:
-            found.append(_grown(scaled, min(contained, key=lambda f: f.sum_of_squares), delay))
-        return found
-
-    def _linear(self, structure: Structure, delay: float) -> ComplexArray:
-        """Return the poles (n,) by iterated linear least squares (Sanathanan and Koerner 1963)."""
-        # The line at s = 0 determines the background only; at both ends s may be extreme.
-        inside = slice(1, max(len(self.problem.s) - 1, 2))
-        s = self.problem.s[inside]
-        probe = self.problem.without_background(self.pure_delay)[inside]
-        powers = np.ascontiguousarray(np.vander(s, structure.poles + 1, increasing=True).T)
-        ups = [
-            powers[:count] * (spectrum[inside] * np.exp(-delay * s))
-            for spectrum, count in self.problem.drives(structure)
-        ]
-        every = np.concatenate([-powers[1:] * probe, *ups, probe[np.newaxis]])
-        poles = np.full(structure.poles, -1.0, np.complex128)
-        for _ in range(_LINEAR_ITERATIONS):
-            weight = 1 / np.abs(np.prod(1 - s * (1 / poles)[:, np.newaxis], axis=0))
-            # Products of columns suffice for a start.
-            rows = (every * weight).view(np.float64)
-            products = rows @ rows.T
-            solved = inverse_gram(products[:-1, :-1]) @ products[:-1, -1]
-            denominator = np.concatenate([np.ones(1), solved[: structure.poles]])
-            found = _stable(ascending_roots(denominator))
-            if len(found) != structure.poles:
-                break
-            poles = found
-        return poles
+        own, tail = np.empty(0, np.complex128), _KEPT_DELAY * delay
+        for fit in base:
+            own = _stable(fit.dynamics.poles() / scaled.rate)
+            tail = float(fit.nonlinear[-1]) if fit.structure.delay else 0.02 * delay
+        fast = _ADDED_POLE * 1.5 ** np.arange(structure.poles - len(own) - len(added))
+        return scaled.nonlinear_of(np.concatenate([own, added, fast]), tail)
 
 
 def coarser(problem: Problem, every: int) -> Problem:
@@ -335,11 +327,3 @@ def _stable(poles: ComplexArray) -> ComplexArray:
     damped = -np.maximum(np.abs(upper.real), 1e-4 * np.abs(upper)) + 1j * upper.imag
     slow = -np.maximum(np.abs(real), 1e-3).astype(np.complex128)
     return np.asarray(np.concatenate([damped, np.conj(damped), slow]), np.complex128)
-
-
-def _grown(scaled: ScaledStructure, fit: Fit, delay: float) -> FloatArray:
-    """Return the smaller fit with fast poles added; their zeros follow linearly."""
-    added = _ADDED_POLE * 1.5 ** np.arange(scaled.structure.poles - fit.structure.poles)
-    own = _stable(fit.dynamics.poles() / scaled.rate)
-    tail = float(fit.nonlinear[-1]) if fit.structure.delay else 0.02 * delay
-    return scaled.nonlinear_of(np.concatenate([own, added.astype(np.complex128)]), tail)

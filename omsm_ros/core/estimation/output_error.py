@@ -131,14 +131,6 @@ class Problem:
         """Transform of ``values`` (n,), closed to a period, at ``s``, shape (k,)."""
         return np.asarray(fft.rfft(close_period(values, self.period)))[: len(self.s)]
 
-    def without_background(self, lag: Fit) -> ComplexArray:
-        """Return the spectrum (k,) of the output without the background that ``lag`` has.
-
-        Lost samples are replaced by the motion times its gain.
-        """
-        output = self.output - self.background @ lag.background
-        return self.closed_spectrum(np.where(self.used, output, lag.gain * self.input))
-
     @cached_property
     def _spectrum(self) -> ComplexArray:
         closed = np.asarray(fft.rfft(close_period(self.input, self.period)), np.complex128)
@@ -430,11 +422,6 @@ class CompressedProblem:
         """Return the inputs, as :meth:`Problem.drives`."""
         counts = [structure.zeros + 1] + (len(self.inputs) - 1) * [structure.poles + 1]
         return list(zip(self.inputs, counts, strict=True))
-
-    def without_background(self, lag: Fit) -> ComplexArray:
-        """Return the spectrum (k,) of the output without the background that ``lag`` has."""
-        alone = self.target - lag.background @ self.fixed
-        return np.asarray(alone[: 2 * len(self.s)].view(np.complex128))
 
     def project(self, scaled: ScaledStructure, nonlinear: FloatArray) -> Projection:
         """Return the residual at one ψ after the linear parameters are eliminated."""

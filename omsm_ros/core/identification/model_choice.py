@@ -53,10 +53,9 @@ def has_initial_response(
         return False
     if not at_rest:
         return True
-    columns = problem.initial_condition_response(fitted)[problem.used]
     # The fit already contains the part of a decay that is collinear with its parameters.
     known = problem.sensitivity(fitted)
-    columns = np.column_stack([columns, known])
+    columns = np.column_stack([problem.initial_condition_response(fitted)[problem.used], known])
     root = inverse_root(columns.T @ columns)
     explained = float(np.sum(((fitted.residual @ columns) @ root) ** 2))
     rest = fitted.sum_of_squares - explained
@@ -69,11 +68,13 @@ class ChosenModel:
     """The chosen candidate and those that were tried.
 
     free: the free choice, where an order was asked for; else None
+    explored: all fits, with those that the samples cannot identify
     """
 
     chosen: Candidate
     candidates: Sequence[Candidate]
     free: ChosenModel | None = None
+    explored: Sequence[Candidate] = ()
 
 
 def choose_model(
@@ -91,22 +92,26 @@ def choose_model(
     problem, budget = prepared.problem, budget or EvaluationBudget()
     part = problem.sums
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget, part=part)
-    known = {c.fit.structure: c.fit for c in before.candidates} if before else {}
-    points = StartingPoints(part or problem, lag)
-    # Structures in a row often start from the sums that the same fit has filled.
-    refilled = lru_cache(maxsize=1)(part.filled) if part else None
+    known = {c.fit.structure: c.fit for c in before.explored} if before else {}
+    lines = part or problem.lines
+    # Structures in a row often start from the lines that the same fit has filled.
+    refilled = lru_cache(maxsize=1)(lines.filled) if lines else None
 
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
         if structure == lag.structure:
             return lag
         same = known.get(structure)
-        starts = points.of(structure, smaller) if same is None else [same.nonlinear]
         best = min(smaller, key=lambda fit: fit.sum_of_squares, default=lag)
         filled = refilled and refilled(best)
-        return fit(problem, structure, starts, budget=budget, part=filled)
+        if same is None:
+            starts = StartingPoints(filled or problem, lag).of(structure, smaller)
+        else:
+            starts = [same.nonlinear]
+        return fit(problem, structure, starts, budget=budget, part=filled if part else None)
 
-    colour = noise_colour(problem, lag, prepared.steps)
-    explored = explore(fit_structure, order, colour, budget)
+    colour_of = lru_cache(maxsize=1)(lambda fit: noise_colour(problem, fit, prepared.steps))
+    explored = explore(fit_structure, order, colour_of, budget)
+    colour = colour_of(min((c.fit for c in explored), key=lambda fit: fit.sum_of_squares))
     duration = len(problem.input) * problem.period
     candidates = [
         c
@@ -116,11 +121,11 @@ def choose_model(
 
     def chosen(among: list[Candidate], free: ChosenModel | None = None) -> ChosenModel:
         best = choose(among)
-        if part is None:
-            return ChosenModel(best, among, free)
-        exact = fit(problem, best.fit.structure, [best.fit.nonlinear], budget=budget)
-        finished = Candidate(exact, information(exact, colour))
-        return ChosenModel(finished, [finished if c is best else c for c in among], free)
+        if part is not None:
+            exact = fit(problem, best.fit.structure, [best.fit.nonlinear], budget=budget)
+            finished = Candidate(exact, information(exact, colour))
+            best, among = finished, [finished if c is best else c for c in among]
+        return ChosenModel(best, among, free, explored)
 
     free = chosen(candidates)
     if not order:

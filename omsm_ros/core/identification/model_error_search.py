@@ -155,8 +155,7 @@ class _Search:
             self.nuisance_terms = [*self.nuisance_terms, *added]
             self.grown, self.without = [], []
         else:
-            larger = _grown(self.prepared, self.model, shown[0].term, self.budget)
-            if larger is None:
+            if (larger := _grown(self.prepared, self.model, shown[0].term, self.budget)) is None:
                 self.refused.add(shown[0].term.family)
                 return False
             self.prepared, self.model = larger
@@ -173,8 +172,7 @@ def _initial_model(
     prepared, nuisance_terms = _with_columns(prepared, _drift(prepared, budget))
     prepared, model = choose(prepared, budget)
     prepared, model, budget = _with_errors_in_variables(prepared, model, choose, budget)
-    columns = _modelled_as_poles(prepared, model, budget)
-    if columns:
+    if columns := _modelled_as_poles(prepared, model, budget):
         prepared, added = _with_columns(prepared, columns, nuisance_terms)
         nuisance_terms += added
         prepared, model = choose(prepared, budget)
@@ -233,9 +231,8 @@ def _modelled_as_poles(
     # Compared with the best of all: the chosen one has a parameter more than that.
     rival = min((c.fit for c in model.candidates), key=information)
     diagnostics = ResidualDiagnostics(prepared.problem, best, prepared.steps, _NUISANCE_FAMILIES)
-    fewer = diagnostics.thinned
     # The decimated record is tested first, as for drift.
-    if fewer is not None:
+    if (fewer := diagnostics.thinned) is not None:
         there = fewer.problem.evaluated(rival.structure, rival.nonlinear)
         if not _improving_terms(prepared, fewer, there, budget):
             return []

@@ -38,17 +38,29 @@ def resonance(frequency, damping):
     return TransferFunction.from_ascending([1.0], [1.0, 2 * damping / omega, omega**-2])
 
 
-def frequencies_of(points, structure, shapes):
-    scaled = ScaledStructure(structure, points.problem.rate)
-    return [known_modes(scaled.transfer_function(s, np.ones(1)))[0].frequency for s in shapes]
-
-
 @pytest.mark.parametrize(("frequency", "damping"), [(30.0, 0.02), (80.0, 0.05), (140.0, 0.01)])
-def test_linear_least_squares_finds_a_resonance_no_guess_would(frequency, damping):
+def test_a_resonance_is_found_from_the_mode_that_explains_most(frequency, damping):
     points = points_for(resonance(frequency, damping))
     structure = Structure(2, 0, False)
-    found = frequencies_of(points, structure, points.of(structure, []))
-    assert min(abs(f / frequency - 1) for f in found) < 0.01
+    found = fit(points.problem, structure, points.of(structure, []))
+    (mode,) = known_modes(found.dynamics)
+    assert mode.frequency == pytest.approx(frequency, rel=1e-3)
+    assert mode.damping == pytest.approx(damping, rel=0.02)
+
+
+def test_a_small_mode_beside_a_large_one_is_added_to_the_fit_of_that():
+    """1 + a (M - 1) of two modes: a of 0.2 at 40 Hz, and a of 0.01 at 130 Hz."""
+    large, small = resonance(40.0, 0.05), resonance(130.0, 0.03)
+    denominator = np.convolve(large.denominator[::-1], small.denominator[::-1])[::-1]
+    numerator = 0.79 * denominator
+    numerator[:3] += 0.2 * small.denominator + 0.01 * large.denominator
+    points = points_for(TransferFunction.from_ascending(numerator, denominator))
+    structures = Structure(2, 2, False), Structure(4, 4, False)
+    fits = []
+    for structure in structures:
+        fits.append(fit(points.problem, structure, points.of(structure, fits)))
+    found = sorted(mode.frequency for mode in known_modes(fits[-1].dynamics))
+    assert found == pytest.approx([40.0, 130.0], rel=0.005)
 
 
 def test_a_richer_structure_never_fits_worse_than_the_one_it_contains():
