@@ -46,7 +46,7 @@ _CANCELLING = 0.005
 def structures(poles: int) -> list[Structure]:
     """Return the structures with ``poles`` and at most two zeros fewer, smallest first.
 
-    Pairs of poles may have as many zeros: modes beside a motion that is followed as far as seen.
+    Pairs of poles may have as many zeros: modes in addition to a motion that is followed rigidly.
     """
     if poles == 0:
         return [Structure(0, 0, True)]
@@ -84,7 +84,7 @@ def explore(
 
     order: number of poles to go to in any case
     colour_of: returns that of the noise that a fit leaves, see :func:`information`; the best of
-        each order tells it anew, because motion that a poor model leaves is no noise
+        each order gives it anew, because motion that a poor model leaves is no noise
     budget: of the fits; no further order is tried once it is exhausted
 
     Raises IdentificationError for an order out of range.
