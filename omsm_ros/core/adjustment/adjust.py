@@ -199,7 +199,7 @@ def adjust(
     wrong = _wrong_signs(views)
     enough, stated = redundant(scans), {p.name for p in priors}
     walk, least = _walk(detecting, priors), MODEL_SHARE * form.rms.value
-    # What the form merely looks like excuses no source that nobody evaluated.
+    # A source that nobody evaluated counts in full, whatever the form resembles.
     known = np.sqrt(form.mean_uncertainty**2 - sum(size**2 for _, size in form.resembled))
     reasons = reasons_of(refutations, stated, agreement, wrong, walk, accepted, least)
     verdict = verdict_of(

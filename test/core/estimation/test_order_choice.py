@@ -76,7 +76,7 @@ def test_at_most_two_zeros_are_fewer_and_pairs_may_have_as_many_the_smallest_fir
         assert [s.size for s in tried] == sorted(s.size for s in tried)
 
 
-def test_a_mode_beside_a_rigid_motion_needs_no_poles_that_make_it_roll_off():
+def test_a_mode_of_a_rigid_machine_needs_no_poles_that_make_it_roll_off():
     """1 + a (M - 1) with a delay: two zeros for its two poles, and one parameter more."""
     numerator = np.array([1.0, 0.2 / OMEGA, 0.85 * OMEGA**-2])
     rigid = TransferFunction.from_ascending(numerator, [1.0, 0.2 / OMEGA, OMEGA**-2], 1.5e-3)

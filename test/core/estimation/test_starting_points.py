@@ -48,7 +48,7 @@ def test_a_resonance_is_found_from_the_mode_that_explains_most(frequency, dampin
     assert mode.damping == pytest.approx(damping, rel=0.02)
 
 
-def test_a_small_mode_beside_a_large_one_is_added_to_the_fit_of_that():
+def test_a_small_mode_is_added_to_the_fit_of_a_large_one():
     """1 + a (M - 1) of two modes: a of 0.2 at 40 Hz, and a of 0.01 at 130 Hz."""
     large, small = resonance(40.0, 0.05), resonance(130.0, 0.03)
     denominator = np.convolve(large.denominator[::-1], small.denominator[::-1])[::-1]
