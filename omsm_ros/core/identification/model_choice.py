@@ -87,7 +87,7 @@ def choose_model(
 
     budget: of the evaluations; None for a budget of its own
     order: number of poles, 0 to choose it. The free choice is made in any case.
-    before: chosen for nearly the same problem; structures start where they ended there
+    before: chosen for nearly the same problem; structures start from its fits, up to its order
     """
     problem, budget = prepared.problem, budget or EvaluationBudget()
     part = problem.sums
@@ -103,14 +103,13 @@ def choose_model(
         same = known.get(structure)
         best = min(smaller, key=lambda fit: fit.sum_of_squares, default=lag)
         filled = refilled and refilled(best)
-        if same is None:
-            starts = StartingPoints(filled or problem, lag).of(structure, smaller)
-        else:
-            starts = [same.nonlinear]
+        points = StartingPoints(filled or problem, lag)
+        starts = points.of(structure, smaller) if same is None else [same.nonlinear]
         return fit(problem, structure, starts, budget=budget, part=filled if part else None)
 
     colour_of = lru_cache(maxsize=1)(lambda fit: noise_colour(problem, fit, prepared.steps))
-    explored = explore(fit_structure, order, colour_of, budget)
+    least = before.chosen.fit.structure.poles if before else 0
+    explored = explore(fit_structure, max(order, least), colour_of, budget)
     colour = colour_of(min((c.fit for c in explored), key=lambda fit: fit.sum_of_squares))
     duration = len(problem.input) * problem.period
     candidates = [

@@ -162,7 +162,8 @@ class _Search:
             self.grown.append(at_fitted_pole(shown[0].term, self.model.chosen.fit))
             self.without.append(diagnostics)
             return True
-        self.prepared, self.model = self.choose(self.prepared, self.budget)
+        before = self.model if self.budget.exhausted else None
+        self.prepared, self.model = self.choose(self.prepared, self.budget, before)
         return True
 
 
