@@ -133,7 +133,7 @@ def test_what_was_lost_for_longer_than_a_new_sample_stays_lost():
 
 
 def test_an_order_that_is_asked_for_ends_in_the_least_minimum():
-    """There the residual has less power than the noise; one of four modes is weak."""
+    """In that minimum the residual has less power than the noise; one of four modes is weak."""
     rng = np.random.default_rng(2)
     u, y = rng.normal(size=600), np.zeros(600)
     frequency, damping = rng.uniform(0.03, 0.4, 4), np.exp(rng.uniform(-5.3, -3, 4))

@@ -83,7 +83,7 @@ def test_neither_a_transient_nor_lost_readings_count_as_noise():
     found = best_linear_approximation(ringing, one)
     expected = np.sqrt(2) * 2e-9 / np.sqrt(4 * one.period)
     assert np.sqrt(np.mean(found.noise**2)) == pytest.approx(expected, rel=0.25, abs=0)
-    # Of each realisation but the first, one period after the phases changed.
+    # Each realisation but the first has it in the period after the phases changed.
     assert np.sqrt(np.sum(found.transient**2)) > 20e-9
 
 
