@@ -264,7 +264,7 @@ class Problem:
     @cached_property
     def sums(self) -> CompressedProblem | None:
         """A long problem by sums over lines, in which orders are explored; None for a short one."""
-        long = len(self.target) > 2 * ENOUGH_SAMPLES and self.lines is not None
+        long = len(self.used) > 2 * ENOUGH_SAMPLES and not self.fits_initial_condition
         return CompressedProblem.of(self, _SUMS) if long else None
 
     def on_grid(self, values: FloatArray, elsewhere: float) -> FloatArray:

@@ -131,7 +131,7 @@ def test_sums_over_lines_are_those_over_the_compared_samples(further, lines):
     np.testing.assert_allclose(at.normal()[1], exact.normal()[1], rtol=0.3)
 
 
-@pytest.mark.parametrize("missing", [0.0, 0.2])
+@pytest.mark.parametrize("missing", [0.0, 0.2, 0.8])
 def test_a_long_record_is_explored_by_fewer_sums_to_the_same_minimum(missing):
     structure = Structure(2, 1, True)
     problem = problem_of(resonance(60.0, 0.2), noise=1e-8)
