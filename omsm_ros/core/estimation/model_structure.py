@@ -8,10 +8,9 @@ G(0) = 1.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
-from numpy.polynomial import polynomial
 
 from omsm_ros.core.lti.transfer_function import ComplexArray, Structure, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
@@ -57,15 +56,11 @@ class ScaledStructure:
 
     def lag(self, nonlinear: FloatArray, s: ComplexArray) -> ComplexArray:
         """Return L = e^{-τs} / denominator at scaled ``s`` = jω (k,), (k,)."""
-        first, *others = [_section_at(each, s) for each in self.sections(nonlinear)] or [
-            1.0 + 0 * s
-        ]
-        denominator = first
-        for other in others:
-            denominator *= other
-        if not self.structure.delay:
-            return np.asarray(1 / denominator)
-        return np.asarray(_delayed(s, float(nonlinear[-1])) / denominator)
+        denominator = np.ones_like(s)
+        for section in self.sections(nonlinear):
+            denominator *= _section_at(section, s)
+        late = _delayed(s, float(nonlinear[-1])) if self.structure.delay else 1.0
+        return np.asarray(late / denominator)
 
     def lag_slopes(self, nonlinear: FloatArray, s: ComplexArray) -> ComplexArray:
         """Return d ln L / dψ (len ψ, k) at scaled ``s`` (k,), see :meth:`lag`."""
@@ -80,9 +75,7 @@ class ScaledStructure:
 
     def transfer_function(self, nonlinear: FloatArray, numerator: FloatArray) -> TransferFunction:
         """Return G(s) in SI units, from ψ and the scaled ascending ``numerator``."""
-        denominator: FloatArray = np.ones(1)
-        for section in self.sections(nonlinear):
-            denominator = np.asarray(polynomial.polymul(denominator, section), np.float64)
+        denominator = reduce(np.convolve, [np.eye(1)[0], *self.sections(nonlinear)])
         return TransferFunction(
             numerator / self.rate ** np.arange(len(numerator)),
             denominator / self.rate ** np.arange(len(denominator)),
@@ -100,10 +93,8 @@ class ScaledStructure:
         sections = self.sections(nonlinear)
         for column in range(poles):
             pair, power = (column, 1) if column < len(sections) else (column - len(sections), 2)
-            product: FloatArray = np.zeros(power + 1)
-            product[power] = sections[pair][power]
-            for other in sections[:pair] + sections[pair + 1 :]:
-                product = np.asarray(polynomial.polymul(product, other), np.float64)
+            product = np.eye(3)[power, : power + 1] * sections[pair][power]
+            product = reduce(np.convolve, [product, *sections[:pair], *sections[pair + 1 :]])
             jacobian[zeros + 1 : zeros + len(product), zeros + column] = product[1:]
         if self.structure.delay:
             jacobian[-1, -1] = 1.0

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -194,10 +195,10 @@ class ParallelSections:
         Its coefficients lose digits with every pole: see ``continuous_error`` in the certificate.
         """
         factors = [np.trim_zeros(np.array([1.0, *d]), "b") for d in self.denominators]
-        down = _product(factors)
+        down = reduce(np.convolve, [np.ones(1), *factors])
         up = self.direct[input] * down
         for place, section in enumerate(self.numerators[input]):
-            others = _product(factors[:place] + factors[place + 1 :])
+            others = reduce(np.convolve, [np.ones(1), *factors[:place], *factors[place + 1 :]])
             up = polynomial.polyadd(up, polynomial.polymul(np.trim_zeros(section, "b"), others))
         up = np.trim_zeros(up, "b")
         return TransferFunction(up if len(up) else np.zeros(1), down, float(self.delays[input]))
@@ -317,13 +318,6 @@ def _numerator_of(poles: ComplexArray, residues: ComplexArray) -> list[float]:
     return [float(b0.real), float((np.sum(residues) / product).real)]
 
 
-def _product(factors: list[FloatArray]) -> FloatArray:
-    found: FloatArray = np.ones(1)
-    for factor in factors:
-        found = np.asarray(polynomial.polymul(found, factor), np.float64)
-    return found
-
-
 # Least damping ratio that a start may have, and range of its |poles|.
 _LEAST_DAMPING, _SLOWEST, _FASTEST = 1e-5, 1e-6, 1e4
 
@@ -365,3 +359,23 @@ def relocated(
 def stacked(values: ComplexArray) -> FloatArray:
     """Return real and imaginary parts of ``values`` (q, k) side by side, (q, 2k)."""
     return np.concatenate([values.real, values.imag], axis=1)
+
+
+def sections_of(nonlinear: FloatArray, order: int) -> FloatArray:
+    """Return d1, d2 (k, 2) of the nonlinear parameters; d2 is 0 for a single pole."""
+    pairs = order // 2
+    count = order - pairs
+    found = np.zeros((count, 2))
+    found[:, 0] = np.exp(nonlinear[:count])
+    found[:pairs, 1] = np.exp(nonlinear[count:order])
+    return found
+
+
+def slowed(nonlinear: FloatArray, order: int, fastest: float) -> FloatArray:
+    """Return nonlinear parameters whose pairs of real poles are at most ``fastest``."""
+    found, (first, second) = nonlinear.copy(), sections_of(nonlinear, order)[: order // 2].T
+    real = np.flatnonzero(first**2 > 4 * second)
+    slow = first[real] / 2 + np.sqrt(first[real] ** 2 / 4 - second[real])
+    slow, fast = (np.maximum(lag, 1 / fastest) for lag in (slow, second[real] / slow))
+    found[real], found[order - order // 2 + real] = np.log(slow + fast), np.log(slow * fast)
+    return found

@@ -30,6 +30,8 @@ from omsm_ros.core.estimation.parallel_sections import (
     orthogonal_decays,
     recursion,
     relocated,
+    sections_of,
+    slowed,
     stacked,
     variable,
 )
@@ -39,6 +41,8 @@ from omsm_ros.linear_algebra import inverse_gram, inverse_root, without_copy
 
 # Unit of w inside a fit, in 1/T: the middle of the range of sampled poles.
 RATE = 0.5
+# Twice half the sampling rate, as w inside a fit: samples show no faster pole.
+_FASTEST = 2 * np.pi / RATE
 # Least share of the largest power at which a line is excited.
 _EXCITED = 1e-3
 # Most lines of one record for vector fitting, evenly among the excited ones.
@@ -214,19 +218,18 @@ class SectionsProblem:
 
     def late(self, nonlinear: FloatArray, order: int) -> FloatArray:
         """Return the delay of each input [samples], (m,)."""
-        if self.hold == BAND_LIMITED:
-            return np.asarray(nonlinear[order:] / RATE)
-        return np.asarray(self.delays, np.float64)
+        found = nonlinear[order:] / RATE if self.hold == BAND_LIMITED else self.delays
+        return np.asarray(found, np.float64)
 
     def box(self, order: int) -> tuple[FloatArray, FloatArray]:
         """Return the bounds of the nonlinear parameters."""
-        ends = ScaledStructure(Structure(order, order, False), RATE).bounds()
-        count = self.inputs if self.hold == BAND_LIMITED else 0
-        longest = max(len(record) for record in self.records) / 4 * RATE
-        return (
-            np.concatenate([ends[0], np.zeros(count)]),
-            np.concatenate([ends[1], np.full(count, longest)]),
-        )
+        lower, upper = ScaledStructure(Structure(order, order, False), RATE).bounds()
+        if self.hold != BAND_LIMITED:
+            return lower, upper
+        lower[order // 2 :] = -np.log(_FASTEST)
+        lower[order - order // 2 :] *= 2
+        longest = np.full(self.inputs, max(len(record) for record in self.records) / 4 * RATE)
+        return np.pad(lower, (0, self.inputs)), np.append(upper, longest)
 
     def project(self, nonlinear: FloatArray, order: int) -> Projection:
         """Return the residual after the linear parameters are eliminated."""
@@ -263,9 +266,11 @@ class SectionsProblem:
         box = self.box(order)
 
         def project(nonlinear: FloatArray) -> Projection:
+            if self.hold == BAND_LIMITED:
+                nonlinear = np.clip(slowed(nonlinear, order, _FASTEST), *box)
             return self.project(nonlinear, order)
 
-        tried = [descend(project, project(np.clip(s, *box)), box, evaluations) for s in starts]
+        tried = [descend(project, project(s), box, evaluations) for s in starts]
         best = min(tried, key=lambda one: float(one.residual @ one.residual))
         linear = best.linear.reshape(self.inputs, -1)
         return SectionsFit(self, order, best.nonlinear, linear, best.residual)
@@ -441,16 +446,6 @@ class _Columns:
 def _numerator_places(sections: FloatArray) -> BoolArray:
     """Return which of b0 and b1 each section has, (k, 2): a single pole has no b1."""
     return np.column_stack([np.full(len(sections), True), sections[:, 1] > 0])
-
-
-def sections_of(nonlinear: FloatArray, order: int) -> FloatArray:
-    """Return d1, d2 (k, 2) of the nonlinear parameters; d2 is 0 for a single pole."""
-    pairs = order // 2
-    count = order - pairs
-    found = np.zeros((count, 2))
-    found[:, 0] = np.exp(nonlinear[:count])
-    found[:pairs, 1] = np.exp(nonlinear[count:order])
-    return found
 
 
 def grown_starts(problem: SectionsProblem, smaller: SectionsFit, order: int) -> list[ComplexArray]:

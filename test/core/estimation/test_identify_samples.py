@@ -97,6 +97,18 @@ def test_stated_uncertainties_hold_over_many_records(colour):
     assert 0.92 < np.mean(np.abs(pulls) < 2) < 0.985
 
 
+@pytest.mark.parametrize("fast", [[-400.0], [-90.0, -400.0], [-3 - 200j, -3 + 200j]])
+def test_superfluous_poles_of_smooth_inputs_are_no_faster_than_the_samples_show(fast):
+    rng = np.random.default_rng(4)
+    u = signal.lfilter(*signal.butter(4, 0.7), rng.normal(size=1500))
+    y = signal.lfilter([0.3, 0.5, 0.2], [1.0, -0.9], u) + rng.normal(0, 0.01, len(u))
+    problem = SectionsProblem([record(u, y)], "band-limited", np.zeros(1, int))
+    start = problem.nonlinear_of(np.array([-0.2, *fast]), np.zeros(1))
+    fitted = problem.fit(1 + len(fast), [start])
+    assert np.max(np.abs(fitted.model().poles())) < 2 * np.pi * (1 + 1e-9)
+    assert np.std(fitted.residual) < 0.02 * np.std(y)
+
+
 @pytest.mark.soak
 def test_units_do_not_matter():
     u, y = recorded("zero-order")
