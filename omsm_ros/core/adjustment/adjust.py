@@ -373,8 +373,7 @@ def _findings(
         effect, spread = solution.network.effect(family.name, values, covariance)
         found.append(
             SourceFinding(
-                name=family.name,
-                unit=family.unit,
+                name=family.name, unit=family.unit,
                 declared=stated.get(base_name(family.name)),
                 found=values,
                 uncertainty=np.sqrt(np.maximum(np.diag(covariance), 0.0)),

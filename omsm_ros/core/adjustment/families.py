@@ -216,7 +216,7 @@ def _geometric(r: Ranges) -> list[Family]:
         _one("expansion", "1", lambda v: v.lateral_error(v.x, v.y), 3e-5, REFERENCE, 5e-6),
         _curve("positioning_x", "m", r.slide, r, lambda v, w: np.stack(
             [v.across(*way) for bow in w(v.slide_x) for way in ((bow, 0.0), (0.0, bow))]),
-            1e-6, beyond, 2, 5e-8),
+            1e-5, beyond, 2, 5e-8),
         _one("centre_x", "m", lambda v: v.across(1.0, 0.0), 2e-5, beyond),
         _one("centre_y", "m", lambda v: v.across(0.0, 1.0), 2e-5, beyond),
         Family("parallelism", "rad", 2, lambda v: np.stack(
@@ -234,6 +234,9 @@ def _geometric(r: Ranges) -> list[Family]:
 
 _OVER = (("straightness_x", "positioning_x", "straightness_hysteresis"),
          ("straightness_z", "pitch"))  # fmt: skip
+# A screw with a lead of 2 mm makes waves, which over a part of 25 mm have this length relative to
+# the way of X; of the position by a good scale they are a small share.
+_SHORT, _OF_WAVES = 0.08, 0.25
 
 
 def _curve(
@@ -257,6 +260,9 @@ def _curve(
     lengths = [length for n, length in r.lengths.items() if n in same]
     length = min(lengths, default=(nodes[-1] - nodes[0]) / 2**0.5)
     parts = components(smooth(length), nodes)
+    if name == "positioning_x":
+        waves = components(smooth(_SHORT * (nodes[-1] - nodes[0])), nodes)
+        parts = np.concatenate([parts, _OF_WAVES * waves])
     place = np.linspace(-1.0, 1.0, len(nodes))
     if ways == 2:
         # Their mean is the place of the spindle axis; the line of a position is the scale of its
@@ -306,14 +312,6 @@ def _waves(angle: FloatArray, per_turn: float) -> tuple[FloatArray, FloatArray]:
     return np.cos(per_turn * angle), np.sin(per_turn * angle)
 
 
-def _axial(n: float) -> Columns:
-    return lambda v: np.stack(_waves(v.c, n))
-
-
-def _tilting(n: float) -> Columns:
-    return lambda v: v.slide_x * np.stack(_waves(v.c, n))
-
-
 def _radial(n: float) -> Columns:
     return lambda v: np.stack(
         [v.across(*way) for wave in _waves(v.c, n) for way in ((wave, 0.0), (0.0, wave))]
@@ -335,11 +333,13 @@ def _of_the_spindle(priors: Sequence[Source]) -> list[Family]:
         return [*usual, *(n for n in more if order_name(name, n) not in known)]
 
     table: tuple[tuple[str, str, int, Sequence[float], Callable[[float], Columns], float], ...] = (
-        ("spindle_axial", "m", 2, (*SPINDLE_HARMONICS, *SUB_HARMONICS), _axial, 1e-7),
-        ("spindle_tilt", "rad", 2, _TILT_HARMONICS, _tilting, 1e-5),
+        ("spindle_axial", "m", 2, (*SPINDLE_HARMONICS, *SUB_HARMONICS),
+         lambda n: lambda v: np.stack(_waves(v.c, n)), 1e-7),
+        ("spindle_tilt", "rad", 2, _TILT_HARMONICS,
+         lambda n: lambda v: v.slide_x * np.stack(_waves(v.c, n)), 1e-5),
         ("spindle_radial", "m", 4, _RADIAL_HARMONICS, _radial, 1e-6),
         ("c_error", "rad", 2, _C_HARMONICS, _angular, 1e-4),
-    )
+    )  # fmt: skip
     # Every scale of C has errors of a few arc seconds; a ring of 50 mm may be off by 2.5 µm.
     tested = any(p.name == "clocking" and p.evaluated for p in priors)
     defaults = {"c_error/1": 1e-5 if tested else 1e-4, "c_error/2": 1e-5,

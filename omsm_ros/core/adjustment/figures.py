@@ -128,11 +128,7 @@ def form_map(
     terms, coefficients, term_covariance = _reported(made, doubts)
     shown = by_height[[every.index(t) for t in terms]] @ more
     return FormMap(
-        x=places.x,
-        y=places.y,
-        height=made.height,
-        area=places.area,
-        covariance=covariance,
+        x=places.x, y=places.y, height=made.height, area=places.area, covariance=covariance,
         pv=pv,
         rms=rms,
         disc=solution.network.part.disc,
@@ -142,7 +138,7 @@ def form_map(
         removed=made.removed,
         pose=made.pose,
         alike=alike,
-    )
+    )  # fmt: skip
 
 
 class Effect(NamedTuple):

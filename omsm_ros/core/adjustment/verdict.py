@@ -93,11 +93,14 @@ def reasons_of(
     least: effect below which a cause has no name: the model of the form may have made it [m]
     """
     found = [Reason(WRONG_SIGN, (str(scan),), share, 0.0) for scan, share in wrong_sign]
-    causes = [r for r in refutations if not r.minor and set(accepted).isdisjoint(_names(r))]
+    # An error that was removed with the wrong sign passes for others.
+    seen = () if wrong_sign else refutations
+    causes = [r for r in seen if not r.minor and set(accepted).isdisjoint(_names(r))]
     size, beyond = walk
     walks = beyond > _RARE_WALK
     # To the centre time and slide are one, and a line whose phase wanders is none.
-    of_walk: tuple[str, ...] = ("drift_walk", "straightness_x", VIBRATION)
+    minor = [r.name for r in seen if r.minor and r.evidence.family.named]
+    of_walk: tuple[str, ...] = ("drift_walk", "straightness_x", VIBRATION, *minor)
     if not all(r.explains for r in causes):
         # A cause that no family explains may stand behind all others that were found.
         found.append(Reason(UNIDENTIFIED, (), max(r.evidence.deviate for r in causes), 3.0))

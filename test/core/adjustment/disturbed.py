@@ -44,6 +44,7 @@ KINDS = {
     "creep": {"creep": 3e-4},
     "stretch": {"stretch": 1e-4},
     "bow_of_z": {"bow_of_z": 1e-6},
+    "screw": {"screw": 1e-6},
     "noise": {"noise": 40e-9},
     "walk": {"walk": 5e-9},
 }

@@ -120,8 +120,8 @@ class Machine:
         seen = place(
             c - self.latency * omega + wrong.get("c_lost", 0.0) * (t > 0.5 * duration)
             + wrong.get("c_once", 0.0) * np.cos(c),
-            r - self.latency * r_rate, wrong.get("centre_x", 0.0) + bow + lateral[0],
-            wrong.get("centre_y", 0.0) + lateral[1],
+            r - self.latency * r_rate + wrong.get("screw", 0.0) * np.sin(np.pi * r / 1e-3 + 1.0),
+            wrong.get("centre_x", 0.0) + bow + lateral[0], wrong.get("centre_y", 0.0) + lateral[1],
         )  # fmt: skip
         at = (seen[0] + 1j * seen[1]) * np.exp(-1j * turned) - complex(*moved)
         seen = (at.real, at.imag)

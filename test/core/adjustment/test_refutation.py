@@ -37,6 +37,7 @@ TWO_SCANS = [
         ("lag_by_z", "lag_motion", None),
         ("lag_by_x", "lag_x", None),
         ("warming", "drift_rate", None),
+        ("screw", "positioning_x", None),
     ),
 ]
 # Uncertainty that is left where an error in part looks like form: a lag that depends on the place
@@ -44,7 +45,7 @@ TWO_SCANS = [
 # alone, between which the form is turned.
 IN_PART_FORM_M = {
     "lag_by_z": 24e-9, "lag_by_x": 22e-9, "latency": 12e-9, "creep": 15e-9, "c_lost": 35e-9,
-    "warming": 24e-9,
+    "warming": 24e-9, "screw": 150e-9,
 }  # fmt: skip
 
 
