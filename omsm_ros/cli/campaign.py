@@ -77,15 +77,9 @@ class Entry:
 
 
 def run_campaign(
-    folder: Path,
-    calibration: Path,
-    out: Path,
-    options: Sequence[str] = (),
-    *,
-    jobs: int = 0,
-    scheduler: str = "",
-    progress: Progress = state_progress,
-) -> list[Entry]:
+    folder: Path, calibration: Path, out: Path, options: Sequence[str] = (), *, jobs: int = 0,
+    scheduler: str = "", progress: Progress = state_progress,
+) -> list[Entry]:  # fmt: skip
     """Correct every bag below ``folder`` into ``out``; return the state of each, by name.
 
     options: of ``omsm correct``, for every bag;  jobs: parallel processes, 0 = one per core

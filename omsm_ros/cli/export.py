@@ -34,12 +34,9 @@ _COMMENT = "written by omsm_ros, lengths in metres"
 
 
 def export(
-    source: Path,
-    out: Path,
-    units: LengthUnits | None = None,
-    spacing: float | None = None,
+    source: Path, out: Path, units: LengthUnits | None = None, spacing: float | None = None,
     channel: str | None = None,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Write ``source`` to ``out``, whose suffix names the format; return facts of the file.
 
     units: of a source that does not state them;  spacing: of a map made of scattered points [m]

@@ -112,14 +112,9 @@ class Issue:
 
 
 def fill_study(
-    title: str,
-    subtitle: str,
-    verdict: PageVerdict,
-    sections: Sequence[Section],
-    captions: Mapping[str, str],
-    figures: Mapping[str, bytes],
-    **more: object,
-) -> str:
+    title: str, subtitle: str, verdict: PageVerdict, sections: Sequence[Section],
+    captions: Mapping[str, str], figures: Mapping[str, bytes], **more: object,
+) -> str:  # fmt: skip
     """Return the page of a study as HTML: verdict, then sections of figures and tables.
 
     captions, figures: captions and PNG files by name

@@ -46,11 +46,9 @@ _CORRELATED_SHARE = 0.5
 
 
 def verdict_of(
-    matched: Matched,
-    agreement: ComparisonAgreement | None,
-    unknown: tuple[Notice, ...],
+    matched: Matched, agreement: ComparisonAgreement | None, unknown: tuple[Notice, ...],
     shared: float,
-) -> tuple[str, tuple[Notice, ...]]:
+) -> tuple[str, tuple[Notice, ...]]:  # fmt: skip
     """Return AGREE, DIFFER or CANNOT_TELL, and the reasons, the most important first.
 
     agreement: None if the uncertainty of a measurement is not known;  unknown: the reasons
@@ -179,12 +177,9 @@ class Comparison:
 
 
 def compare_measurements_of_part(
-    a: ComparedMeasurement,
-    b: ComparedMeasurement,
-    dofs: Sequence[str] = SEATED,
-    spacing: float | None = None,
-    length: float | None = None,
-) -> Comparison:
+    a: ComparedMeasurement, b: ComparedMeasurement, dofs: Sequence[str] = SEATED,
+    spacing: float | None = None, length: float | None = None,
+) -> Comparison:  # fmt: skip
     """Compare two measurements of one part, the second moved onto the first by ``dofs``.
 
     spacing: of the places [m], None: as the coarser of both allows

@@ -257,11 +257,9 @@ def _carried(half: ComparisonSide, fields: ErrorFields) -> dict[str, FloatArray]
 
 
 def _drifts(
-    halves: tuple[ComparisonSide, ComparisonSide],
-    matched: Matched,
-    known: tuple[MeasurementErrors, MeasurementErrors],
-    shared: tuple[str, ...],
-) -> list[dict[str, FloatArray]]:
+    halves: tuple[ComparisonSide, ComparisonSide], matched: Matched,
+    known: tuple[MeasurementErrors, MeasurementErrors], shared: tuple[str, ...],
+) -> list[dict[str, FloatArray]]:  # fmt: skip
     found: list[dict[str, FloatArray]] = [{}, {}]
     longest = max(half.measurement.duration for half in halves)
     unit: dict[int, FloatArray] = {}

@@ -80,16 +80,12 @@ def with_pose_uncertainty(fit: ZernikeFit, map_: DeviationMap, found: Registrati
     the shift, for each undetermined pose parameter and each pose error.
     """
     few = map_.every(_MOST_POINTS)
-    slopes = (
-        fit.coefficients @ along / fit.disc.radius
-        for along in zernike_slopes(*fit.disc.scaled(few.x, few.y), fit.terms)
-    )
-    moves = np.concatenate(
-        [found.displaced(few.x, few.y), found.undetermined_displacements(few.x, few.y)]
-    )
-    changes = -np.einsum("rin,in->rn", moves, np.stack(list(slopes)))
+    places = fit.disc.scaled(few.x, few.y)
+    slopes = fit.coefficients @ np.stack(zernike_slopes(*places, fit.terms)) / fit.disc.radius
+    shifts = found.displaced(few.x, few.y), found.undetermined_displacements(few.x, few.y)
+    changes = -np.einsum("rin,in->rn", np.concatenate(shifts), slopes)
     root = np.sqrt(few.area)
-    columns = zernike_values(*fit.disc.scaled(few.x, few.y), fit.terms)
+    columns = zernike_values(*places, fit.terms)
     effects = np.linalg.lstsq((columns * root).T, (changes * root).T, rcond=None)[0]
     effects[:, : fit.effects.shape[1]] += fit.effects
     return replace(fit, effects=effects)

@@ -209,9 +209,8 @@ class GridCells:
 
         even: the points are an evenly spaced grid; each has its own cell, up to 512 across
         """
-        steps, before = (_of_grid(map_.x, map_.y) if even else None) or _of_scattered(
-            map_.x, map_.y
-        )
+        of_grid = _of_grid(map_.x, map_.y) if even else None
+        steps, before = of_grid or _of_scattered(map_.x, map_.y)
         at = [
             (values - values.min()) / step + before
             for values, step in zip((map_.x, map_.y), steps, strict=True)

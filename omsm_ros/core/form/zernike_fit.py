@@ -132,9 +132,8 @@ def fit_zernikes(
     root = np.linalg.cholesky(gram * np.outer(scale, scale))
     inverse = np.linalg.inv(root) * scale
     inverse = inverse.T @ inverse
-    found = scale[:, np.newaxis] * np.linalg.solve(
-        root.T, np.linalg.solve(root, scale[:, np.newaxis] * right)
-    )
+    half = np.linalg.solve(root, scale[:, np.newaxis] * right)
+    found = scale[:, np.newaxis] * np.linalg.solve(root.T, half)
     scores = _scores(x, y, deviation, found[:, 0], used, disc, weights, inverse)
     fit = ZernikeFit(
         disc=disc,
@@ -181,12 +180,14 @@ class RimStrip(NamedTuple):
         from scipy.sparse import csr_array  # these take long to load
         from scipy.spatial import cKDTree
 
+        if outline.outline == "polygon":
+            return None
         outline = outline.disc if outline.outline == "annulus" else outline
         ends, rim = _around(outline)
         depth = _STRIP * spacing / float(np.hypot(*rim).min())
         size = outline.share_of_rim(*places)
         points = np.flatnonzero(size > 1 - 2 * depth)
-        if outline.outline == "polygon" or depth >= 0.5 or len(points) < _AROUND:
+        if depth >= 0.5 or len(points) < _AROUND:
             return None
         near_rim = places[:, points]
         # The nearest single points may lie on one track: means are half a track long.
@@ -316,9 +317,8 @@ def _scores(
         begins, differences = np.arange(0, len(x), size), 0
     ends = np.append(begins[1:], len(x))
     sums, (single, missed) = np.empty((len(terms), len(begins))), np.zeros((2, *inverse.shape))
-    squares = np.array([comb(differences, k) for k in range(differences + 1)]) ** 2 / comb(
-        2 * differences, differences
-    )
+    binomial = np.array([comb(differences, k) for k in range(differences + 1)])
+    squares = binomial**2 / comb(2 * differences, differences)
     # Share of the square of each sum that the differences contain.
     shown = np.convolve(np.ones(len(begins) - differences), squares)
     first = 0

@@ -140,9 +140,7 @@ class FarPoints:
         # A larger one is no slope of the form if it is dust itself.
         like = (ratio > 1 / _SIMILAR) & ((ratio < _SIMILAR) | (little[pairs.row] & known))
         like &= events[pairs.col] != event[at][pairs.row]
-        count, company = (
-            np.bincount(pairs.row[v], minlength=len(at)) for v in (like, like & known)
-        )
+        count, company = (np.bincount(pairs.row[v], None, len(at)) for v in (like, like & known))
         # Where few points are around, dust too has company; only clusters tell.
         around = space.around(rows[4][at])
         decided = little | (around >= _FEW / _SHARE_AROUND)
@@ -172,9 +170,8 @@ class FarPoints:
         while True:
             for begin in range(0, len(open_), _AT_A_TIME):
                 part = open_[begin : begin + _AT_A_TIME]
-                away, near = tree.query(
-                    rows[1:3, part].T, _AROUND + 1, distance_upper_bound=space.reach
-                )
+                places = rows[1:3, part].T
+                away, near = tree.query(places, _AROUND + 1, distance_upper_bound=space.reach)
                 there = np.isfinite(away[:, 1:])
                 same = np.where(there, np.append(size, 0.0)[near[:, 1:]], 0.0)
                 ranked = np.sort(same * np.sign(rows[3, part])[:, np.newaxis], axis=1)

@@ -300,9 +300,8 @@ def held_dof_effects(
     portion = PointBatch(there[0], there[1], there[2], np.empty((0, len(points.x))))
     rows = np.zeros((2 * len(steps), len(points.x)))
     for k, step in enumerate(steps):
-        high, low = (
-            placed(surface, at.moved(names, side * step), portion).deviation for side in (1, -1)
-        )
+        ends = (at.moved(names, way) for way in (step, -step))
+        high, low = (placed(surface, end, portion).deviation for end in ends)
         rows[2 * k], rows[2 * k + 1] = (high - low) / 2, (high + low) / 2 - points.deviation
     # At the rim a step may leave the surface, where the effect is not defined.
     return np.nan_to_num(rows, copy=False)

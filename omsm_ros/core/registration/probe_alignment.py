@@ -165,28 +165,25 @@ def _checked_radius(free: optimize.OptimizeResult, radius: float) -> bool:
 
 
 def _with(geometry: Geometry, unknown: FloatArray) -> Geometry:
-    centred = replace(
-        geometry,
-        centre_x=float(unknown[0]) * MICROMETRE_M,
-        centre_y=float(unknown[1]) * MICROMETRE_M,
-    )
+    x, y = map(float, unknown[:2] * MICROMETRE_M)
+    centred = replace(geometry, centre_x=x, centre_y=y)
     if len(unknown) == 5:
         return centred
-    return replace(
-        centred, beam_x=float(unknown[5]) * _SLOPE_UNIT, beam_y=float(unknown[6]) * _SLOPE_UNIT
-    )
+    x, y = map(float, unknown[5:] * _SLOPE_UNIT)
+    return replace(centred, beam_x=x, beam_y=y)
 
 
 def _misfit(scan: SphereScan, radius: float, geometry: Geometry, unknown: FloatArray) -> FloatArray:
     """Return the distances of the points from the sphere [µm], (n,)."""
-    points = workpiece_points(
-        _with(geometry, unknown), (scan.x, scan.y, scan.z), scan.b, scan.c, scan.distance
-    )
-    centre = unknown[2:5] * MICROMETRE_M
-    away = np.sqrt(
-        (points.x - centre[0]) ** 2 + (points.y - centre[1]) ** 2 + (points.height - centre[2]) ** 2
-    )
+    away = np.sqrt(np.sum(_from_centre(scan, geometry, unknown) ** 2, axis=0))
     return np.asarray((away - abs(radius)) / MICROMETRE_M, np.float64)
+
+
+def _from_centre(scan: SphereScan, geometry: Geometry, unknown: FloatArray) -> FloatArray:
+    """Return the points from the centre of the sphere (3, n) [m]."""
+    slides = (scan.x, scan.y, scan.z)
+    points = workpiece_points(_with(geometry, unknown), slides, scan.b, scan.c, scan.distance)
+    return np.stack(points) - unknown[2:5, np.newaxis] * MICROMETRE_M
 
 
 def _jacobian(scan: SphereScan, geometry: Geometry, unknown: FloatArray) -> FloatArray:
@@ -195,9 +192,7 @@ def _jacobian(scan: SphereScan, geometry: Geometry, unknown: FloatArray) -> Floa
     Analytic in the centres, because on a centred sphere an offset across the feed has a
     second-order effect only, which finite differences would hide in their rounding.
     """
-    slides = (scan.x, scan.y, scan.z)
-    points = workpiece_points(_with(geometry, unknown), slides, scan.b, scan.c, scan.distance)
-    away = np.stack(points) - unknown[2:5, np.newaxis] * MICROMETRE_M
+    away = _from_centre(scan, geometry, unknown)
     x, y, z = away / np.sqrt(np.sum(away**2, axis=0))
     cosine, sine = np.cos(scan.c), np.sin(scan.c)
     columns = [y * sine - x * cosine, -x * sine - y * cosine, -x, -y, -z]
@@ -205,14 +200,7 @@ def _jacobian(scan: SphereScan, geometry: Geometry, unknown: FloatArray) -> Floa
         # The end of the beam is nearly linear in its inclination: a difference over a milliradian.
         step = np.zeros_like(unknown)
         step[k] = 0.5
-        ends = [
-            np.stack(
-                workpiece_points(
-                    _with(geometry, unknown + sign * step), slides, scan.b, scan.c, scan.distance
-                )
-            )
-            for sign in (1, -1)
-        ]
+        ends = [_from_centre(scan, geometry, unknown + way) for way in (step, -step)]
         columns.append(np.sum((ends[0] - ends[1]) * [x, y, z], axis=0) / MICROMETRE_M)
     return np.stack(columns, axis=1)
 

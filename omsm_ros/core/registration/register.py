@@ -56,7 +56,7 @@ from omsm_ros.core.registration.pose_parameters import (
 from omsm_ros.core.streams import statistics
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.aperture import Aperture, disc_of, within_aperture
-from omsm_ros.core.surface.area_weights import area_weights
+from omsm_ros.core.surface.area_weights import area_weights, covered_places
 from omsm_ros.core.surface.posed import PosedSurface
 from omsm_ros.core.surface.shape_parameters import start_of
 from omsm_ros.errors import DataError
@@ -179,8 +179,8 @@ def register(
 def _measured_area(x: FloatArray, y: FloatArray, outline: Aperture, even: bool) -> FloatArray:
     """Return places x, y [m] and areas whose sums are integrals over what points cover (3, k).
 
-    Where points x, y (n,) [m] cover the ``outline``, these are its nodes: areas of single points
-    are not exact, so that coma would have a tilt.
+    Where points x, y (n,) [m] cover the ``outline``, these are its nodes, else an even grid: areas
+    of single points are not exact, so that coma would have a tilt.
     """
     from scipy.spatial import cKDTree  # takes long to load
 
@@ -191,6 +191,9 @@ def _measured_area(x: FloatArray, y: FloatArray, outline: Aperture, even: bool) 
         away, _ = cKDTree(np.column_stack([x, y])).query(nodes[:2].T)
         if np.max(away) < _NEXT_TRACK * track:
             return nodes
+        if not even:
+            grid = covered_places(x, y, outline)
+            return np.append(grid, np.ones((1, grid.shape[1])), axis=0)
     x, y = (v[:: -(-len(v) // _MOST_OF_BASIS)] for v in (x, y))
     return np.stack([x, y, area_weights(x, y, even=even, outline=outline)])
 
@@ -290,12 +293,10 @@ class _PoseFit:
         rigid = replace(at, power=0.0)
         found: dict[str, dict[str, FloatArray]] = {}
         for name in self.dofs.refused:
-            ends = [
-                coarse_placement(
-                    self.surface, few, self.dofs.fitted, None, rigid.moved([name], np.array([off]))
-                )
-                for off in (self.dofs.range(name), -self.dofs.range(name))
-            ]
+            offsets = np.array([[1.0], [-1.0]]) * self.dofs.range(name)
+            starts = (rigid.moved([name], offset) for offset in offsets)
+            fitted = self.dofs.fitted
+            ends = [coarse_placement(self.surface, few, fitted, None, start) for start in starts]
             found[name] = {}
             for n in self.dofs.fitted:
                 high, low = (end.value(n) - rigid.value(n) for end in ends)

@@ -11,8 +11,9 @@ It depends on the path of the scan.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
-from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.quantities import MAP_SPACING
 
@@ -34,6 +35,8 @@ _LEAST_SECTORS, _MOST_SECTORS = round(2 * np.pi / _LARGEST_ARC), 360
 _MOST_CELLS, _FILLED, _OF_RIM, _FINELY_FILLED = 768, 3.5, 2.5, 3.8
 # Cells along the distance of two evenly spaced points, so that points move by an eighth of it.
 _FINER = 4
+# Longest step along a track, in usual steps and distances of points; nearest points of a place.
+_LONGEST, _AROUND = 4.0, 6
 # Largest width of a single line relative to its length.
 LINE_WIDTH = 1e-6
 
@@ -66,6 +69,15 @@ def area_weights(
     whole = np.bincount(group, share, minlength=len(area))
     weights = share * (area / np.where(whole > 0, whole, 1.0))[group]
     return np.asarray(weights / np.mean(weights), np.float64)
+
+
+def covered_places(x: FloatArray, y: FloatArray, outline: Aperture) -> FloatArray:
+    """Return an even grid of places in an ``outline`` that a scan covers (2, k) [m].
+
+    x, y: of the points in scan order (n,) [m]
+    """
+    _, _, middles, _, scanned = _scanned(x, y, outline)
+    return middles[:, scanned]
 
 
 def _along_line(x: FloatArray, y: FloatArray) -> FloatArray | None:
@@ -142,8 +154,22 @@ def _covered(group: IntArray, angle: FloatArray, count: int) -> FloatArray:
 def _nearest(x: FloatArray, y: FloatArray, outline: Aperture | None) -> tuple[IntArray, FloatArray]:
     """Return the cell of each point (n,), and the area that is nearest to each cell (k,).
 
-    The areas are the Voronoi polygons of the occupied cells within the scanned area. The scanned
-    area includes gaps that are narrower than the distance of two tracks, also to the ``outline``.
+    The areas are the Voronoi polygons of the occupied cells within the scanned area.
+    """
+    cell, shape, _, nearest, scanned = _scanned(x, y, outline)
+    owner = nearest[0, scanned] * shape[1] + nearest[1, scanned]
+    return cell, np.bincount(owner, minlength=shape[0] * shape[1]).astype(np.float64)
+
+
+def _scanned(
+    x: FloatArray, y: FloatArray, outline: Aperture | None
+) -> tuple[IntArray, tuple[int, int], FloatArray, IntArray, BoolArray]:
+    """Return the tile of each point (n,), the number of tiles in x and y, and with a margin around:
+
+    Their middles [m] and the tiles with points nearest to them, both (2, r, c), and which of them
+    the scanned area has (r, c). It includes gaps that are narrower than the distance of two tracks,
+    also to the ``outline``. At wider ones, a point stands for half a step along its track, and half
+    the distance of two tracks across.
     """
     # Imported here: it takes as long to load as to weigh a scan, and spirals do not need it.
     from scipy import ndimage
@@ -162,19 +188,38 @@ def _nearest(x: FloatArray, y: FloatArray, outline: Aperture | None) -> tuple[In
     margin = int(np.ceil(reach)) + 1
     wide = np.pad(filled, margin)
     nearest = ndimage.distance_transform_edt(~wide, return_distances=False, return_indices=True)
-    inside = np.ones(wide.shape, bool)
-    if outline is not None:
-        # The middles of the tiles, with a margin around.
-        middles = [
-            v.min() + (np.arange(-margin, n + margin) + 0.5) * (np.ptp(v) or 1.0) / n
-            for v, n in zip((x, y), shape, strict=True)
-        ]
-        inside = outline.holds(*np.meshgrid(*middles, indexing="ij"))
+    sides = [(np.ptp(v) or 1.0) / n for v, n in zip((x, y), shape, strict=True)]
+    at = [v.min() + (np.arange(-margin, n + margin) + 0.5) * size
+          for v, n, size in zip((x, y), shape, sides, strict=True)]  # fmt: skip
+    middles = np.stack(np.meshgrid(*at, indexing="ij"))
+    inside = np.ones(wide.shape, bool) if outline is None else outline.holds(*middles)
     far = ndimage.distance_transform_edt(inside & ~wide)
-    scanned = (ndimage.distance_transform_edt(far <= reach) > reach) & inside | wide
-    row, column = (places[scanned] - margin for places in nearest)
-    owner = row * shape[1] + column
-    return cell, np.bincount(owner, minlength=filled.size).astype(np.float64)
+    away = ndimage.distance_transform_edt(far <= reach)
+    scanned = (away > reach) & inside | wide
+    if outline is not None and np.any(far > reach):
+        places, area = inside & ~scanned & (away > 0), np.sum(scanned) * float(np.prod(sides))
+        scanned[places] = _stand_for(x + 1j * y, middles[0, places] + 1j * middles[1, places], area)
+    return cell, shape, middles, nearest - margin, scanned
+
+
+def _stand_for(
+    points: NDArray[np.complex128], places: NDArray[np.complex128], area: float
+) -> BoolArray:
+    """Return for which ``places`` (k,) [m] the ``points`` (n,) of a path over an ``area`` stand."""
+    from scipy.spatial import cKDTree  # takes long to load
+
+    steps, sizes = np.diff(points), np.abs(np.diff(points))
+    # A jump to another track is no part of the path.
+    longest = _LONGEST * max(float(np.median(sizes)), np.sqrt(area / len(points)))
+    track = area / np.sum(sizes, where=sizes < longest)
+    rows = (v.view(np.float64).reshape(-1, 2) for v in (points, places))
+    _, near = cKDTree(next(rows)).query(next(rows), _AROUND)
+    before, after = np.append(steps[:1], steps), np.append(steps, steps[-1:])
+    step = np.where(np.abs(before) < np.abs(after), before, after)[near]
+    # Along the track and across it, times the step.
+    apart, size = (places[:, np.newaxis] - points[near]) * step.conj(), np.abs(step)
+    within = (np.abs(apart.real) <= size**2 / 2) & (np.abs(apart.imag) <= size * track / 2)
+    return np.asarray(np.any(within, axis=1))
 
 
 def _tiles(x: FloatArray, y: FloatArray, side: int) -> tuple[IntArray, tuple[int, int]]:

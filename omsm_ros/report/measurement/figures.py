@@ -89,13 +89,9 @@ def registered_map(
 
 
 def _draw_map(
-    part: FigureBase,
-    raster: Raster,
-    unit: str,
-    title: str,
-    limits: Limits | None = None,
+    part: FigureBase, raster: Raster, unit: str, title: str, limits: Limits | None = None,
     quantity: str = "deviation",
-) -> None:
+) -> None:  # fmt: skip
     scale = UNITS_M[unit]
     # Fixed positions, so that maps side by side have equal size.
     axes, bar = part.add_axes(_MAP_PLACE), part.add_axes(_BAR_PLACE)

@@ -361,3 +361,26 @@ def test_a_groove_about_as_deep_as_outliers_does_not_go_in_and_out_without_end(d
     batch = PointBatch(x, y, height, np.empty((0, len(x))))
     found = register(Flat(), lambda: [batch], ("piston", "tip", "tilt"))
     assert (found.placement.pose.tip, found.placement.pose.tilt) == pytest.approx((0, 0), abs=1e-7)
+
+
+@pytest.mark.parametrize("path", ["turns", "lines"])
+def test_a_missing_sector_has_no_share_in_the_pose(path):
+    """The pose is that of the covered area, which ends half a step beyond its last points."""
+    radius, form = 5e-3, lambda x, y: 4e-3 * (x**2 - y**2 + x * y) + 1.0 * (x**3 + x * y**2)
+    there = lambda x, y: np.abs(np.angle((x + 1j * y) * np.exp(-0.4j))) > 0.5  # noqa: E731
+    way, lines = np.linspace(0, 1, 20_000), np.linspace(-1, 1, 62)[1:-1]
+    x, y = np.array([np.cos(way * 120 * np.pi), np.sin(way * 120 * np.pi)]) * way * radius
+    if path == "lines":
+        along = np.linspace(-1, 1, 400) * np.where(np.arange(60) % 2, -1, 1)[:, np.newaxis]
+        x, y = along.ravel() * radius, np.repeat(lines, 400) * radius
+    kept = there(x, y) & (np.hypot(x, y) <= radius)
+    x, y = x[kept], y[kept]
+    batch = PointBatch(x, y, form(x, y), np.empty((0, len(x))))
+    found = register(Flat(), lambda: [batch], ("piston", "tip", "tilt"), aperture=Aperture(radius))
+    u, v = radius * np.stack(np.meshgrid(*[(np.arange(1000) + 0.5) / 500 - 1] * 2)).reshape(2, -1)
+    covered = there(u, v) & (np.hypot(u, v) <= radius)
+    u, v = u[covered], v[covered]
+    plane = np.linalg.lstsq(np.stack([np.ones_like(u), u, v], 1), form(u, v), rcond=None)[0]
+    pose = found.placement.pose
+    away = [pose.piston - plane[0], (pose.tilt + plane[1]) * radius, (pose.tip - plane[2]) * radius]
+    assert np.max(np.abs(away)) < 1e-3 * np.ptp(form(u, v))
