@@ -13,7 +13,7 @@ from omsm_ros.instruments.blocks import BlockPair
 
 # Requests of other threads wait for a read to end, so it is short [s].
 _READ_S = 0.05
-# From one connection to the next; two counters that were reset need 1.3 s more, and 2 s in all [s].
+# Time from one connection to the next: at first, and at most [s].
 BACK_OFF_S = (0.25, 0.5)
 
 

@@ -321,6 +321,24 @@ def test_a_triggered_device_may_be_silent(cell: Any) -> None:
     assert float(run.device.identity["SHZ"]) > 1000
 
 
+def test_a_connection_that_the_device_forgot_is_made_again_within_two_seconds(cell: Any) -> None:
+    """It stays open, so nothing but the silence shows it."""
+    run = cell()
+    run.run(1.0)
+    forgetful, before = run.instrument, run.delivered
+    forgetful.receive, forgetful.streaming = lambda _: None, lambda: False
+
+    def remember() -> None:
+        del forgetful.receive, forgetful.streaming, forgetful.greet
+
+    forgetful.greet = remember
+    run.run(2.0)
+    assert run.connections == 2
+    assert run.delivered > before
+    run.end()
+    run.check()
+
+
 def test_dark_reference_is_asked_for(cell: Any) -> None:
     run = cell()
     run.run(0.5)

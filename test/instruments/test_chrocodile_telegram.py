@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 import time
 
@@ -327,3 +328,19 @@ def test_long_runs_of_digits_are_no_telegram_at_once(end: bytes) -> None:
     assert len(made.feed(b" 0" * 10 + b"\r\n" + garbled + end + b"\r\n")) == 1
     assert made.statistics.losses_of_sync == 1
     assert time.process_time() - started < 1.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_counter_with_a_flipped_bit_moves_no_reading_to_another_sample(seed: int) -> None:
+    """Each reading that is handed over states its own number."""
+    random = np.random.default_rng(seed)
+    records = some(3000, seed=seed)
+    records["33024"] = records["83"]  # the distance is the true number
+    struck = random.random(len(records)) < 0.02
+    records["83"] ^= np.where(struck, 1 << random.integers(0, 16, len(records)), 0).astype(">u2")
+    wire = records.tobytes()
+    cuts = [0, *np.sort(random.integers(0, len(wire), 300)), len(wire)]
+    portions = (wire[a:b] for a, b in itertools.pairwise(cuts))
+    found = everything(decoder(), *portions)
+    np.testing.assert_array_equal(found["83"], found["33024"])
+    assert len(found) > len(records) - 3 * struck.sum()

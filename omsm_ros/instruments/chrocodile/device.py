@@ -195,7 +195,7 @@ class Chrocodile(StreamDevice):
         self._begin()
         model = self._try("VER").text  # a refusal has no digits
         self._identity = {"model": model if any(map(str.isdigit, model)) else "CHRocodile"}
-        intact = self._ever_set_up and self._is_unchanged(before)
+        intact = self._ever_set_up and self._is_unchanged(before, DeviceTimeoutError)
         self._try("MMD", 0)
         self._read("MMD")
         if self._identity.get("MMD", "0") != "0":
@@ -238,13 +238,14 @@ class Chrocodile(StreamDevice):
         except RefusedError:
             return Answer(b"", "")
 
-    def _is_unchanged(self, before: dict[str, str]) -> bool:
+    def _is_unchanged(self, before: dict[str, str], *suppressed: type[DeviceError]) -> bool:
         """Return whether the device was not restarted since the settings ``before`` were read.
 
-        A new client has ordered no signals: an empty selection or no answer is no sign. Setting
-        the trigger again would reset the counter, and with it the pairing with another device.
+        A new client has ordered no signals: an empty selection, or an error that is ``suppressed``,
+        is no sign. Setting the trigger again would reset the counter, and with it the pairing with
+        another device.
         """
-        with suppress(DeviceTimeoutError):
+        with suppress(*suppressed):
             found = self._try("SODX", QUERY).numbers
             if found and not set(self._selection) <= set(found):
                 return False
@@ -318,7 +319,8 @@ class Chrocodile(StreamDevice):
 
     def _listen_in(self, silent: float) -> None:
         """Check that a silent device still has its settings; a free-running one must send."""
-        if self._check_settings(silent) and self._wanted.trigger == "free_run":
+        asked = self._check_settings(silent) and silent >= self._wanted.patience
+        if asked and self._wanted.trigger == "free_run":
             self._unheard = True
             raise NoSamplesError(
                 f"{self._transport.name} answers, but sent no readable telegram for "
@@ -328,7 +330,8 @@ class Chrocodile(StreamDevice):
     def _check_settings(self, waited: float) -> bool:
         """Return whether it was time to check them; DeviceError if the device has others."""
         now = self._monotonic()
-        if min(waited, now - self._asked) < self._wanted.patience:
+        # TCP does not show that the device forgot a connection, so this is half of the patience.
+        if min(waited, now - self._asked) < self._wanted.patience / 2:
             return False
         self._asked = now
         if not self._is_unchanged(self._identity):

@@ -7,10 +7,9 @@ The two sync bytes of a telegram also occur in the data, in each telegram where 
 So the decoder counts bytes from ``ready`` on, and searches only if a sync is missing or the sample
 counter jumps. If several places could begin a telegram, the sample counter decides. A telegram is
 accepted once sync and counter of the next one have arrived: bytes lost inside it show there. A bit
-flipped in a value cannot be detected in this protocol.
+flipped in a counter shows by the even steps of its neighbours, one in a value cannot be detected.
 """
 
-import itertools
 import math
 import re
 from typing import NamedTuple
@@ -29,10 +28,10 @@ from omsm_ros.instruments.chrocodile.telegram import (
 )
 from omsm_ros.instruments.counting import WireCounts
 
-# Two telegrams between damaged bytes belong together if at most this many samples are missing.
+# A counter that goes on by more jumps [samples].
 _NEAR = 16
-# A place is accepted after this many telegrams with consecutive counters.
-_DEEP = 8
+# So many telegrams with even steps of their counter confirm each other.
+_ROW = 3
 # Matches a number in one way only; with more ways a long run of digits takes hours.
 _NUMBER_BYTES = rb"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 
@@ -47,56 +46,84 @@ class BinaryDecoder:
         self._buffer = b""
         self._synchronised = False
         self._counter = _Counter(layout)
-        # A telegram before a jump of the counter; it is accepted if the next one follows it.
-        self._doubtful = b""
-        self._in_place = False
+        # Telegrams without a loss between them, of which the first ones are decided, and whether
+        # the buffer goes on with the next one; where the counter jumps, that shows they are whole.
+        self._row, self._decided, self._joined = b"", 0, False
         self._received = self._telegrams = self._losses = 0
 
     def reset(self, *, synchronised: bool) -> None:
         """Discard an incomplete telegram; ``synchronised``: the next byte begins one."""
-        self._buffer = self._doubtful = b""
-        self._synchronised, self._in_place = synchronised, False
-        self._counter.forget()
+        self._buffer = self._row = b""
+        self._synchronised, self._joined, self._decided = synchronised, False, 0
 
     def feed(self, data: bytes) -> Records:
         """Return telegrams that ``data`` confirms, shape (n,); n may be 0."""
         self._received += len(data)
         self._buffer += data
-        parts = []
-        while self._synchronised or self._search():
-            parts += [self._cleared(), self._take()]
+        parts, found = [], False
+        while self._synchronised or (found := self._search()):
+            if not self._joined:
+                parts.append(self._even(b"", 1))
+            parts.append(self._even(self._take(b"" if found else self._row)))
             if self._synchronised:
                 break
-        found = np.frombuffer(b"".join(parts), self._dtype)
+        return self._counted(b"".join(parts))
+
+    def settle(self) -> Records:
+        """Return the last telegrams if they are complete and no byte follows; shape (n,)."""
+        count, rest = divmod(len(self._buffer), self._layout.length)
+        placed = count == 1 and (self._synchronised or self._joined)
+        if (
+            rest
+            or not (placed or 1 < count <= _ROW)
+            or not self._buffer.startswith(self._layout.sync)
+        ):
+            return np.empty(0, self._dtype)
+        before = b"" if self._joined else self._even(b"", 1)
+        last = self._even(self._buffer, math.inf)
+        self._buffer, self._synchronised = b"", True
+        return self._counted(before + last)
+
+    def _counted(self, wire: bytes) -> Records:
+        found = np.frombuffer(wire, self._dtype)
         self._telegrams += len(found)
         return found
 
-    def settle(self) -> Records:
-        """Return the last telegram if it is complete and no byte follows; shape (n,), n 0 to 2."""
-        whole = len(self._buffer) == self._layout.length
-        placed = self._synchronised or self._in_place
-        if not (placed and whole and self._buffer.startswith(self._layout.sync)):
-            return np.empty(0, self._dtype)
-        found = np.frombuffer(self._cleared() + self._buffer, self._dtype)
-        self._buffer, self._synchronised = b"", True
-        self._counter.forget()
-        self._telegrams += len(found)
+    def _even(self, wire: bytes, most: float = -1) -> bytes:
+        """Return the telegrams whose counters are in even steps with two neighbours.
+
+        Those that the next ones may confirm wait for them, unless none follow, as ``most`` says:
+        with fewer than three, their greatest step.
+        """
+        last = most >= 0
+        row, length = self._row + wire, self._layout.length
+        even = self._counter.even(row, len(row) // length, most)
+        stop = len(even) if last else max(self._decided, len(even) - 2)
+        stop += int(np.argmin([*even[stop:], False]))
+        if self._joined and not (self._synchronised or last):
+            stop = max(min(stop, len(even) - 1), self._decided)
+        good = even[self._decided : stop]
+        found = row[self._decided * length : stop * length]
+        if not good.all():
+            found = np.frombuffer(found, self._dtype)[good].tobytes()
+        kept = 0 if last else min(stop, 2)
+        self._row, self._decided = row[(stop - kept) * length :] if not last else b"", kept
         return found
 
     @property
     def statistics(self) -> WireCounts:
         """Return the counts of bytes, telegrams, and losses of synchronisation."""
-        decoded, waits = self._telegrams * self._layout.length, len(self._buffer + self._doubtful)
+        decoded = self._telegrams * self._layout.length
+        row = len(self._row) - self._decided * self._layout.length
+        waits = len(self._buffer) + row
         counts = {"telegrams": self._telegrams, "losses_of_sync": self._losses}
         return WireCounts(self._received, decoded, waits, **counts)
 
-    def _cleared(self) -> bytes:
-        """Return the telegram before a jump, since the next one follows it."""
-        cleared, self._doubtful, self._in_place = self._doubtful, b"", False
-        return cleared
+    def _take(self, row: bytes) -> bytes:
+        """Return telegrams up to the last one that is followed by another, or to a missing sync.
 
-    def _take(self) -> bytes:
-        """Return telegrams up to the last one that is followed by another, or to a missing sync."""
+        row: those before, with which a jump of the counter shows
+        """
         length, buffer = self._layout.length, self._buffer
         whole = len(buffer) // length
         records = np.frombuffer(buffer, self._dtype, whole)
@@ -107,82 +134,36 @@ class BinaryDecoder:
         # The telegram before a missing sync is too short or too long, so it is dropped.
         begun = int(bad[0]) if len(bad) else whole + (len(rest) >= self._counter.needs)
         count = max(0, begun - 1)
-        leap = self._counter.leap(buffer, begun, count)
+        leap = self._counter.leap(row, buffer, begun)
         if leap == begun and not len(bad):
-            self._buffer = buffer[count * length :]
+            self._buffer, self._joined = buffer[count * length :], True
             return buffer[: count * length]
-        if leap < begun:
-            count, after = max(0, leap - 1), leap * length
-            self._doubtful, self._in_place = buffer[count * length : after], True
-        else:
-            after = count * length + int(bad[0] > 0)
-        self._buffer = buffer[after:]
+        self._joined = leap < begun
+        count = leap if self._joined else count
+        self._buffer = buffer[count * length + (not self._joined and bad[0] > 0) :]
         self._synchronised = False
         self._losses += 1
-        self._counter.forget()
         return buffer[: count * length]
 
     def _search(self) -> bool:
         """Go to the beginning of telegrams; drop the bytes before it."""
-        size = 2 * (_DEEP + 2) * self._layout.length  # enough for a decision
-        while True:
-            window = self._buffer[:size]
-            size *= 4
-            place, settled = _first_of(self._places(window), self._layout.length, len(window))
-            if place is None:
-                place = len(window) - window.endswith(self._layout.sync[:1])
-            whole = len(self._buffer) == len(window)
-            self._buffer = self._buffer[place:]
-            if place:
-                self._doubtful, self._in_place = b"", False
-            if settled or whole:
-                self._synchronised = settled
-                return settled
-
-    def _places(self, window: bytes) -> dict[int, int]:
-        """Return the places where two telegrams begin, or may, and the step of their counters."""
-        length, size = self._layout.length, len(window)
-        raw = np.frombuffer(window + bytes(2 * length), np.uint8)
+        length, size = self._layout.length, len(self._buffer)
+        raw = np.frombuffer(self._buffer + bytes(2 * length), np.uint8)
         first, second = self._layout.sync
-        sync = (raw[:-1] == first) & (raw[1:] == second)
-        starts = np.flatnonzero(sync[:size])
-        starts = starts[sync[starts + length] | (starts + length + 2 > size)]
-        steps = self._counter.steps(raw, starts)
-        found = (starts + 2 * length > size) | ((steps >= 1) & (steps <= _NEAR))
-        return dict(zip(starts[found].tolist(), steps[found].tolist(), strict=True))
-
-
-def _first_of(places: dict[int, int], length: int, size: int) -> tuple[int | None, bool]:
-    """Return the first of ``places`` that begins a telegram, and whether that is decided.
-
-    places: [bytes], ascending, of ``size``: where two telegrams begin, or may, and the step of
-        their counters. The result is the place within one telegram with the longest
-        sequence of telegrams, and of equal ones that with the smallest steps.
-    """
-
-    def rank(place: int) -> tuple[float, float]:
-        """Return the least and the greatest rank that ``place`` may have."""
-        steps = 0
-        for here in range(place, place + _DEEP * length, length):
-            if here not in places:
-                return here, here if here + 2 <= size else math.inf
-            if here + 2 * length > size:
-                return here, math.inf
-            steps += places[here]
-        return size + 1 / steps, size + 1 / steps
-
-    candidates = list(places)
-    for i, place in enumerate(candidates):
-        if place + 2 * length > size:
-            return place, False
-        least, most = rank(place)
-        rivals = itertools.takewhile((place + length).__gt__, candidates[i + 1 :])
-        others = [rank(rival) for rival in rivals]
-        if all(high <= least for _, high in others):
-            return place, True
-        if not any(low > most for low, _ in others):
-            return place, False
-    return None, False
+        starts = np.flatnonzero((raw[:size] == first) & (raw[1 : size + 1] == second))
+        after = starts + length
+        # Two telegrams with consecutive counters begin here, or may when all bytes have come.
+        fits = (raw[after] == first) & (raw[after + 1] == second) | (after + 2 > size)
+        fits &= self._counter.follow(raw, starts) | (after + length > size)
+        row = range(0, _ROW * length, length)
+        known = set(starts[fits].tolist())
+        found = [p for p in sorted(known) if all(p + n in known or p + n + 2 > size for n in row)]
+        place = found[0] if found else size - self._buffer.endswith(bytes([first]))
+        self._buffer = self._buffer[place:]
+        if place and self._joined:
+            self._row, self._joined = self._row[:-length], False
+        self._synchronised = bool(found) and place + (_ROW + 1) * length <= size
+        return self._synchronised
 
 
 class _Counter:
@@ -198,34 +179,43 @@ class _Counter:
             self._offset = layout.offsets[index]
             self._modulus = 2 ** (8 * self._kind.itemsize)
             self.needs = self._offset + self._kind.itemsize
-        self.forget()
 
-    def forget(self) -> None:
-        """Begin with the next telegram."""
-        self._last: int | None = None
-        self._step = 1
-
-    def steps(self, raw: NDArray[np.uint8], starts: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Return the steps from telegrams in ``raw`` at ``starts`` (n,) to the next ones."""
+    def follow(self, raw: NDArray[np.uint8], starts: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return whether counters of telegrams in ``raw`` at ``starts`` (n,) go on in the next."""
         if not self._has_one:
-            return np.ones(len(starts), np.intp)
+            return np.ones(len(starts), np.bool_)
         here, after = (self._read(raw, places) for places in (starts, starts + self._length))
-        return np.asarray((after - here) % self._modulus)
+        return np.asarray((after - here) % self._modulus == 1)
 
-    def leap(self, wire: bytes, begun: int, count: int) -> int:
+    def even(self, wire: bytes, count: int, most: float) -> NDArray[np.bool_]:
+        """Return which of the ``count`` telegrams in ``wire`` are in a row of even steps, (n,).
+
+        most: greatest step of fewer telegrams than a row has
+        """
+        if not (self._has_one and count):
+            return np.ones(count, np.bool_)
+        steps = self._steps(wire, count)[1:]
+        if count < _ROW:
+            return np.full(count, steps.max(initial=0) <= most)
+        even = (steps[1:] == steps[:-1]) & (steps[1:] <= 1)
+        return np.convolve(even, np.ones(_ROW)) > 0
+
+    def leap(self, row: bytes, wire: bytes, begun: int) -> int:
         """Return the first of the ``begun`` telegrams in ``wire`` after a jump, or ``begun``.
 
-        A constant counter, or the same step twice, is no jump. Those before ``count`` are done.
+        A constant counter, or the same step twice, is no jump.  row: telegrams before them
         """
         if not self._has_one or not begun:
             return begun
-        now = self._read(np.frombuffer(wire, np.uint8), self._length * np.arange(begun))
-        first = now[0] - self._step if self._last is None else self._last
-        steps = np.diff(now, prepend=first) % self._modulus
-        leaps = (steps > _NEAR) & (np.diff(steps, prepend=self._step) != 0)
-        if count:
-            self._last, self._step = int(now[count - 1]), int(steps[count - 1])
+        known = len(row) // self._length
+        steps = self._steps(row + wire, known + begun)
+        leaps = ((steps > _NEAR) & (np.diff(steps, prepend=1) != 0))[known:]
         return int(np.argmax(leaps)) if leaps.any() else begun
+
+    def _steps(self, wire: bytes, count: int) -> NDArray[np.intp]:
+        """Return the steps to each of the ``count`` telegrams in ``wire``, 1 to the first."""
+        now = self._read(np.frombuffer(wire, np.uint8), self._length * np.arange(count))
+        return np.asarray(np.diff(now, prepend=now[0] - 1) % self._modulus)
 
     def _read(self, raw: NDArray[np.uint8], starts: NDArray[np.intp]) -> NDArray[np.intp]:
         """Return the counters (n,) of telegrams in ``raw`` at ``starts`` (n,)."""

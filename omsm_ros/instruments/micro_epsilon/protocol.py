@@ -10,7 +10,6 @@ above mark them: 00 low, 01 middle, 10 high in the first value of a frame, 11 hi
 So a missing byte always shows.
 """
 
-import itertools
 import struct
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
@@ -294,33 +293,25 @@ class PlausibleValueFilter:
 
     def __init__(self, width: int) -> None:
         """width: values in a frame."""
-        self._width = width
-        self._needed = -(-_PLAUSIBLE_VALUES // width)
+        self._width, self._needed = width, -(-_PLAUSIBLE_VALUES // width)
         self.unconfirmed = 0
         self.reset()
 
     def reset(self) -> None:
         """Drop the frames that wait, as after a new connection."""
-        self._waiting: list[tuple[IntArray, IntArray]] = []
+        self._values = np.empty((0, self._width), np.int64)
+        self._spoilt = np.empty(0, np.int64)
         self._confirmed = False
 
     def feed(self, values: IntArray, spoilt: IntArray) -> tuple[IntArray, IntArray]:
         """Return the frames that are confirmed, of those from :meth:`SerialDecoder.feed`."""
-        found: list[tuple[IntArray, IntArray]] = []
-        breaks = np.flatnonzero(spoilt)
-        edges = np.unique(np.concatenate([[0], breaks, [len(values)]]))
-        for start, end in itertools.pairwise(edges):
-            if spoilt[start]:
-                self.unconfirmed += self._held()
-                self.reset()
-            self._waiting.append((values[start:end], spoilt[start:end]))
-            if self._confirmed or self._held() >= self._needed:
-                self._confirmed = True
-                found += self._waiting
-                self._waiting = []
-        if not found:
-            return np.empty((0, self._width), np.int64), np.empty(0, np.int64)
-        return np.concatenate([f for f, _ in found]), np.concatenate([s for _, s in found])
-
-    def _held(self) -> int:
-        return sum(len(values) for values, _ in self._waiting)
+        values, spoilt = np.append(self._values, values, 0), np.append(self._spoilt, spoilt)
+        row = np.cumsum(spoilt > 0)  # in row 0 frames go on with those before
+        lengths = np.bincount(row, minlength=1)
+        lengths[0] += self._needed * self._confirmed
+        good = lengths[row] >= self._needed
+        waits = ~good & (row == len(lengths) - 1)
+        self.unconfirmed += int(np.sum(~good & ~waits))
+        self._values, self._spoilt = values[waits], spoilt[waits]
+        self._confirmed = bool(lengths[-1] >= self._needed)
+        return values[good], spoilt[good]
