@@ -18,7 +18,6 @@ from benchmarks.row import Row, at_least, at_most, shown
 from benchmarks.step_test import StepTest
 from benchmarks.twin_motions import respond
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.estimation.covariance import inter_sample_motion_covariance
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import Motion, StepPlan, plan_steps
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, response_band
@@ -103,17 +102,12 @@ def monte_carlo(seeds: range, make: Callable[[int], MotionRecord], truth: Transf
 
 
 def scatter(calibration: Calibration) -> FloatArray:
-    """Return the covariance of repeated tests: noise, and motion between samples.
+    """Return the covariance of repeated tests, which is of noise.
 
     The calibration's covariance also includes undetected model errors, which repeated tests share.
     """
     shape = calibration.covariance.shape
-    noise = np.reshape(np.asarray(calibration.certificate.noise_covariance), shape)
-    delay_bound = float(str(calibration.certificate.response.inter_sample_delay_bound_s))
-    allowed = inter_sample_motion_covariance(
-        calibration.dynamics, delay_bound, calibration.sample_period
-    )
-    return np.asarray(noise + allowed)
+    return np.reshape(np.asarray(calibration.certificate.noise_covariance), shape)
 
 
 def _log_ratio(calibration: Calibration, truth: TransferFunction) -> ComplexArray:

@@ -165,26 +165,6 @@ def gain_uncertainty_alone(problem: Problem, fitted: Fit) -> float:
     return float(np.sqrt(every[0, 0]) / abs(fitted.gain))
 
 
-def inter_sample_motion_covariance(
-    dynamics: TransferFunction, delay_bound: float, sample_period: float
-) -> FloatArray:
-    """Return the covariance (p, p) of the coefficients due to motion between samples.
-
-    Aliased motion shifts the lag by up to ``delay_bound`` [s]. It also adds a term in s², because
-    the aliased content varies over a tenth of the sampling rate. Both bounds are taken as uniform
-    distributions, whose standard deviation is 1/√3 of the bound.
-    """
-    zeros, poles = len(dynamics.numerator) - 1, len(dynamics.denominator) - 1
-    directions = np.zeros((2, zeros + poles + 2))
-    bend = delay_bound * sample_period / (2 * np.pi * 0.1)
-    for row, (power, size) in enumerate(((1, delay_bound), (2, bend))):
-        if poles >= power:
-            directions[row, zeros + power] = size / np.sqrt(3)
-        elif power == 1:
-            directions[row, -1] = size / np.sqrt(3)
-    return directions.T @ directions
-
-
 def with_random_walk(
     columns: FloatArray, values: FloatArray, first: BoolArray, walked: FloatArray
 ) -> tuple[float, float, float]:

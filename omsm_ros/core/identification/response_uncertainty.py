@@ -23,16 +23,12 @@ from scipy import fft, linalg, signal
 
 from omsm_ros.core.calibration.certificate import PartsCompared, Undetected, UndetectedEntry
 from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse
-from omsm_ros.core.estimation.covariance import (
-    inter_sample_motion_covariance,
-    noise_spectrum,
-    parameter_covariance,
-)
+from omsm_ros.core.estimation.covariance import noise_spectrum, parameter_covariance
 from omsm_ros.core.estimation.model_structure import Fit
 from omsm_ros.core.estimation.noise import VERY_STRONG
 from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.estimation.preparation import Prepared
-from omsm_ros.core.estimation.steps import LEAST_SAMPLES, Steps
+from omsm_ros.core.estimation.steps import LEAST_SAMPLES, Edge, Steps
 from omsm_ros.core.identification.model_choice import ChosenModel
 from omsm_ros.core.identification.model_error_search import SearchResult
 from omsm_ros.core.identification.residual_tests import (
@@ -61,7 +57,7 @@ from omsm_ros.core.model_errors.undetected import (
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.linear_algebra import unit_columns
+from omsm_ros.linear_algebra import basis_and_inverse, unit_columns
 from omsm_ros.quantities import shown
 
 # Greatest |G| assumed beyond half the sampling rate.
@@ -142,10 +138,34 @@ def reference_lag(record: MotionRecord) -> ReferenceLag | None:
 
 
 def inter_sample_motion(prepared: Prepared, fit: Fit) -> FloatArray:
-    """Return the covariance (p, p) of motion between the samples of an edge."""
-    problem = prepared.problem
+    """Return the covariance (p, p) of the coefficients by motion between the samples of an edge.
+
+    Each corner of a motion, where its third difference is, aliases to an impulse in the output and
+    to one in the input, which passes the response. They are at the same place of every edge, and as
+    large as the bound on the lag, whose distribution is taken as uniform.
+    """
+    problem, samples = prepared.problem, len(prepared.problem.used)
     bound = inter_sample_delay_bound(problem.input, prepared.steps, problem.period)
-    return inter_sample_motion_covariance(fit.dynamics, bound, problem.period)
+    basis, inverse = basis_and_inverse(problem.sensitivity(fit), np.finfo(np.float64).eps)
+    transform = fit.scaled.coefficient_jacobian(fit.nonlinear)
+    shifted = np.zeros((len(transform), samples))
+    shifted[:, problem.used] = transform @ inverse[: fit.structure.size] @ basis.T
+    response = fit.dynamics.response(fft.rfftfreq(samples, problem.period))
+    through = fft.irfft(fft.rfft(shifted) * response.conj(), samples)
+    whole = Edge(0, samples, float(np.sum(np.abs(np.diff(problem.input)))))
+    edges = prepared.steps.edges or (whole,)
+    length = max(edge.stop - edge.start for edge in edges)
+    effects, weights = np.zeros((2, len(transform), length)), np.zeros(length)
+    corners = np.pad(np.diff(problem.input, 3), (2, 1)) ** 2
+    every = np.array([_GREATEST_GAIN_BEYOND * shifted, through])
+    for edge in edges:
+        part, count = slice(edge.start, edge.stop), edge.stop - edge.start
+        effects[..., :count] += edge.height * every[..., part]
+        weights[:count] += corners[part]
+    # One corner has two third differences of like size; either may be its place.
+    size = fit.gain * bound / (1 + _GREATEST_GAIN_BEYOND) / problem.period
+    weights *= size**2 / 3 / (0.5 * np.sum(weights) or 1.0)
+    return np.asarray(np.sum(effects * weights @ np.swapaxes(effects, 1, 2), axis=0))
 
 
 COVARIANCE_TERMS: tuple[Callable[[Prepared, Fit], FloatArray], ...] = (inter_sample_motion,)

@@ -10,12 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import linalg, signal
 
-from omsm_ros.core.estimation.covariance import (
-    autoregression,
-    inter_sample_motion_covariance,
-    noise_spectrum,
-    parameter_covariance,
-)
+from omsm_ros.core.estimation.covariance import autoregression, noise_spectrum, parameter_covariance
 from omsm_ros.core.estimation.noise import (
     motion_scatter,
     plateau_variance,
@@ -25,7 +20,6 @@ from omsm_ros.core.estimation.noise import (
 )
 from omsm_ros.core.estimation.output_error import Problem
 from omsm_ros.core.estimation.steps import Steps, find_steps, sample_noise, segments
-from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 
 PERIOD, REST, RAMP = 1e-3, 200, 40
@@ -291,13 +285,3 @@ def test_a_process_of_known_poles_is_whitened_by_them(poles: list[complex]) -> N
     assert larger == pytest.approx(1e-12 * variance, rel=1e-9, abs=0)
     _, response = signal.freqz([1.0], filter_, worN=np.pi * np.arange(129) / 128)
     assert noise_spectrum(noise, 256) == pytest.approx(4.0 * np.abs(response) ** 2, rel=0.3)
-
-
-def test_motion_unseen_between_samples_moves_lag_and_curvature_by_its_bound() -> None:
-    g = TransferFunction(np.array([1.0, -1e-4]), np.array([1.0, 3e-4, 6e-8]), 1e-4)
-    found = inter_sample_motion_covariance(g, 2e-6, PERIOD)
-    bend = 2e-6 * PERIOD / (2 * np.pi * 0.1)
-    expected = np.diag([0.0, 0.0, (2e-6) ** 2 / 3, bend**2 / 3, 0.0])
-    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=0)
-    pure = inter_sample_motion_covariance(TransferFunction(np.ones(1), np.ones(1)), 2e-6, PERIOD)
-    np.testing.assert_allclose(pure, np.diag([0.0, (2e-6) ** 2 / 3]), rtol=1e-12, atol=0)

@@ -5,15 +5,26 @@ Sampled, the area becomes a sum of rectangles; sum less integral is the bias of 
 and without any fit.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from soaked import soaked
 
 from benchmarks.step_test import StepTest
 from benchmarks.twin_motions import respond
+from omsm_ros.core.estimation.model_order import fit
+from omsm_ros.core.estimation.model_structure import ScaledStructure
+from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.estimation.steps import find_steps
-from omsm_ros.core.identification.response_uncertainty import inter_sample_delay_bound
+from omsm_ros.core.identification.response_uncertainty import (
+    inter_sample_delay_bound,
+    inter_sample_motion,
+)
 from omsm_ros.core.kinematics.trajectories import Chirp
-from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.lti.frequency_response import response_band
+from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
+from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import PAPER_DYNAMICS, Plant
@@ -37,6 +48,32 @@ def bias_of(rise, servo, dynamics=PAPER_DYNAMICS):
     input_, output = moved.slide[250:], moved.probe[250:]
     area = PERIOD * np.sum(input_ - output) / (input_[-1] - input_[0])
     return float(area) - dynamics.low_frequency_delay
+
+
+@pytest.mark.parametrize(
+    ("dynamics", "poles"), [(FIRST_ORDER, [-1 / 3e-4, -6e4]), (LIGHT_MODE, LIGHT_MODE.poles())]
+)
+@pytest.mark.parametrize("servo", [35.0, *soaked(60.0)])
+def test_the_uncertainty_holds_how_sharp_edges_bend_a_fit(dynamics, poles, servo):
+    """The structure is true and there is no noise: all that is wrong comes between samples."""
+    lines, stated = np.array([5.0, 30.0, 60.0]), []
+    for rise in (0.0, 20e-3):
+        cell = Cell(plant=Plant(dynamics, servo_bandwidth=servo), encoder_noise=0.0)
+        cell = replace(cell, probe=replace(cell.probe, noise=1e-13, resolution=1e-13))
+        made = record(cell, StepTest(rise=rise), Flat(), stand_off=-49e-6)
+        prepared = prepare(assemble([made.axes], [made.distance]), "encoder")
+        problem, structure = prepared.problem, Structure(2, 0, True)
+        scaled = ScaledStructure(structure, problem.rate)
+        start = scaled.nonlinear_of(np.array(poles) / problem.rate, 0.01)
+        fitted = fit(problem, structure, [start])
+        band = response_band(fitted.dynamics, inter_sample_motion(prepared, fitted), lines)
+        off = np.log(fitted.dynamics.response(lines) / dynamics.response(lines))
+        stated.append(np.concatenate([band.gain, band.phase]))
+        if rise == 0:
+            assert np.all(np.abs(off.real) < 2 * band.gain)
+            assert np.all(np.abs(off.imag) < 2 * band.phase)
+            assert np.max(np.abs(off)) > 1e-4
+    assert np.all(stated[1] < 0.05 * stated[0])
 
 
 def test_area_and_fit_see_the_same_bias():

@@ -8,7 +8,6 @@ from scipy import signal
 
 from omsm_ros.core.estimation.covariance import (
     autoregression,
-    inter_sample_motion_covariance,
     noise_before_fit,
     noise_spectrum,
     parameter_covariance,
@@ -138,15 +137,6 @@ def test_an_uncertain_delay_is_an_uncertain_phase_only():
     band = response_band(G, covariance, np.array([10.0, 100.0]))
     np.testing.assert_allclose(band.phase, 2 * np.pi * np.array([10.0, 100.0]) * 1e-6)
     np.testing.assert_allclose(band.gain, 0, atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    "dynamics", [G, TransferFunction([1.0], [1.0, 1e-3]), TransferFunction([1.0], [1.0], 3e-4)]
-)
-def test_inter_sample_motion_is_a_delay_at_low_frequency(dynamics):
-    covariance = inter_sample_motion_covariance(dynamics, 3e-6, 1e-3)
-    band = response_band(dynamics, covariance, np.array([0.01]))
-    assert band.phase[0] == pytest.approx(2 * np.pi * 0.01 * 3e-6 / np.sqrt(3), rel=1e-3)
 
 
 def test_trust_ends_where_the_band_leaves_its_limits():
