@@ -146,7 +146,7 @@ def inter_sample_motion(prepared: Prepared, fit: Fit) -> FloatArray:
     """
     problem, samples = prepared.problem, len(prepared.problem.used)
     bound = inter_sample_delay_bound(problem.input, prepared.steps, problem.period)
-    basis, inverse = basis_and_inverse(problem.sensitivity(fit), np.finfo(np.float64).eps)
+    basis, inverse = basis_and_inverse(problem.sensitivity(fit), float(np.finfo(float).eps))
     transform = fit.scaled.coefficient_jacobian(fit.nonlinear)
     shifted = np.zeros((len(transform), samples))
     shifted[:, problem.used] = transform @ inverse[: fit.structure.size] @ basis.T
