@@ -344,3 +344,19 @@ def test_a_counter_with_a_flipped_bit_moves_no_reading_to_another_sample(seed: i
     found = everything(decoder(), *portions)
     np.testing.assert_array_equal(found["83"], found["33024"])
     assert len(found) > len(records) - 3 * struck.sum()
+
+
+@pytest.mark.parametrize("kept", [{0}, {0, 2}, {0, 1, 3}])
+@pytest.mark.parametrize("synchronised", [True, False])
+def test_a_line_that_loses_samples_all_the_time_passes_the_others(
+    kept: set[int], synchronised: bool
+) -> None:
+    """A line may be too slow, or another client divided the output of the serial port."""
+    sent = some(5000)
+    sent["65"] = -1  # holds the sync bytes, too
+    sent = sent[[n % 5 in kept for n in range(len(sent))]]
+    wire = sent.tobytes()
+    portions = (wire[n : n + 1000] for n in range(0, len(wire), 1000))
+    found = everything(decoder(synchronised=synchronised), *portions)
+    assert len(found) > 0.99 * len(sent)
+    np.testing.assert_array_equal(found["83"], sent["83"][np.isin(sent["83"], found["83"])])

@@ -73,11 +73,8 @@ class BinaryDecoder:
         """Return the last telegrams if they are complete and no byte follows; shape (n,)."""
         count, rest = divmod(len(self._buffer), self._layout.length)
         placed = count == 1 and (self._synchronised or self._joined)
-        if (
-            rest
-            or not (placed or 1 < count <= _ROW)
-            or not self._buffer.startswith(self._layout.sync)
-        ):
+        whole = not rest and (placed or 1 < count <= _ROW)
+        if not (whole and self._buffer.startswith(self._layout.sync)):
             return np.empty(0, self._dtype)
         before = b"" if self._joined else self._even(b"", 1)
         last = self._even(self._buffer, math.inf)
@@ -102,10 +99,8 @@ class BinaryDecoder:
         stop += int(np.argmin([*even[stop:], False]))
         if self._joined and not (self._synchronised or last):
             stop = max(min(stop, len(even) - 1), self._decided)
-        good = even[self._decided : stop]
-        found = row[self._decided * length : stop * length]
-        if not good.all():
-            found = np.frombuffer(found, self._dtype)[good].tobytes()
+        new = np.frombuffer(row, self._dtype, stop)[self._decided :]
+        found = new[even[self._decided : stop]].tobytes()
         kept = 0 if last else min(stop, 2)
         self._row, self._decided = row[(stop - kept) * length :] if not last else b"", kept
         return found
@@ -114,8 +109,7 @@ class BinaryDecoder:
     def statistics(self) -> WireCounts:
         """Return the counts of bytes, telegrams, and losses of synchronisation."""
         decoded = self._telegrams * self._layout.length
-        row = len(self._row) - self._decided * self._layout.length
-        waits = len(self._buffer) + row
+        waits = len(self._buffer) + len(self._row) - self._decided * self._layout.length
         counts = {"telegrams": self._telegrams, "losses_of_sync": self._losses}
         return WireCounts(self._received, decoded, waits, **counts)
 
@@ -152,17 +146,21 @@ class BinaryDecoder:
         first, second = self._layout.sync
         starts = np.flatnonzero((raw[:size] == first) & (raw[1 : size + 1] == second))
         after = starts + length
-        # Two telegrams with consecutive counters begin here, or may when all bytes have come.
+        # Two telegrams begin here, or may when all bytes have come.
         fits = (raw[after] == first) & (raw[after + 1] == second) | (after + 2 > size)
-        fits &= self._counter.follow(raw, starts) | (after + length > size)
-        row = range(0, _ROW * length, length)
-        known = set(starts[fits].tolist())
-        found = [p for p in sorted(known) if all(p + n in known or p + n + 2 > size for n in row)]
-        place = found[0] if found else size - self._buffer.endswith(bytes([first]))
+        steps = np.where(after + length > size, 1, self._counter.steps(raw, starts))
+        # Where a line loses samples all the time, a longer row of small steps decides.
+        for most, row in ((1, _ROW), (_NEAR, _ROW**2)):
+            known = set(starts[fits & (steps >= 1) & (steps <= most)].tolist())
+            rows = ((p, range(p, p + row * length, length)) for p in sorted(known))
+            places = (p for p, due in rows if all(n in known or n + 2 > size for n in due))
+            place = next(places, size - self._buffer.endswith(bytes([first])))
+            self._synchronised = place + (row + 1) * length <= size
+            if self._synchronised:
+                break
         self._buffer = self._buffer[place:]
         if place and self._joined:
             self._row, self._joined = self._row[:-length], False
-        self._synchronised = bool(found) and place + (_ROW + 1) * length <= size
         return self._synchronised
 
 
@@ -180,25 +178,30 @@ class _Counter:
             self._modulus = 2 ** (8 * self._kind.itemsize)
             self.needs = self._offset + self._kind.itemsize
 
-    def follow(self, raw: NDArray[np.uint8], starts: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return whether counters of telegrams in ``raw`` at ``starts`` (n,) go on in the next."""
+    def steps(self, raw: NDArray[np.uint8], starts: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the steps of counters of telegrams in ``raw`` at ``starts`` (n,) to the next."""
         if not self._has_one:
-            return np.ones(len(starts), np.bool_)
+            return np.ones(len(starts), np.intp)
         here, after = (self._read(raw, places) for places in (starts, starts + self._length))
-        return np.asarray((after - here) % self._modulus == 1)
+        return np.asarray((after - here) % self._modulus)
 
     def even(self, wire: bytes, count: int, most: float) -> NDArray[np.bool_]:
-        """Return which of the ``count`` telegrams in ``wire`` are in a row of even steps, (n,).
+        """Return which of ``count`` telegrams in ``wire`` have even or small steps around, (n,).
 
         most: greatest step of fewer telegrams than a row has
         """
         if not (self._has_one and count):
             return np.ones(count, np.bool_)
-        steps = self._steps(wire, count)[1:]
+        raw = np.frombuffer(wire, np.uint8)
+        steps = self.steps(raw, self._length * np.arange(count - 1))
         if count < _ROW:
             return np.full(count, steps.max(initial=0) <= most)
-        even = (steps[1:] == steps[:-1]) & (steps[1:] <= 1)
-        return np.convolve(even, np.ones(_ROW)) > 0
+        even = (steps[1:] == steps[:-1]) & (steps[1:] <= _NEAR)
+        good = np.convolve(even, np.ones(_ROW)) > 0
+        near = np.convolve((steps >= 1) & (steps <= _NEAR), np.ones(4), "valid") == 4
+        # Small steps suffice where a line loses samples all the time, but not between two rows.
+        good[2:-2] |= near[: max(0, count - 4)] & ~(good[1:-3] & good[3:-1])
+        return good
 
     def leap(self, row: bytes, wire: bytes, begun: int) -> int:
         """Return the first of the ``begun`` telegrams in ``wire`` after a jump, or ``begun``.
@@ -208,14 +211,10 @@ class _Counter:
         if not self._has_one or not begun:
             return begun
         known = len(row) // self._length
-        steps = self._steps(row + wire, known + begun)
+        raw = np.frombuffer(row + wire, np.uint8)
+        steps = np.append(1, self.steps(raw, self._length * np.arange(known + begun - 1)))
         leaps = ((steps > _NEAR) & (np.diff(steps, prepend=1) != 0))[known:]
         return int(np.argmax(leaps)) if leaps.any() else begun
-
-    def _steps(self, wire: bytes, count: int) -> NDArray[np.intp]:
-        """Return the steps to each of the ``count`` telegrams in ``wire``, 1 to the first."""
-        now = self._read(np.frombuffer(wire, np.uint8), self._length * np.arange(count))
-        return np.asarray(np.diff(now, prepend=now[0] - 1) % self._modulus)
 
     def _read(self, raw: NDArray[np.uint8], starts: NDArray[np.intp]) -> NDArray[np.intp]:
         """Return the counters (n,) of telegrams in ``raw`` at ``starts`` (n,)."""
