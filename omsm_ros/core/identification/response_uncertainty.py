@@ -140,7 +140,7 @@ def reference_lag(record: MotionRecord) -> ReferenceLag | None:
 def inter_sample_motion(prepared: Prepared, fit: Fit) -> FloatArray:
     """Return the covariance (p, p) of the coefficients by motion between the samples of an edge.
 
-    Each corner of a motion, where its third difference is, aliases to an impulse in the output and
+    Each corner of a motion, where its fourth difference is, aliases to an impulse in the output and
     to one in the input, which passes the response. They are at the same place of every edge, and as
     large as the bound on the lag, whose distribution is taken as uniform.
     """
@@ -156,13 +156,13 @@ def inter_sample_motion(prepared: Prepared, fit: Fit) -> FloatArray:
     edges = prepared.steps.edges or (whole,)
     length = max(edge.stop - edge.start for edge in edges)
     effects, weights = np.zeros((2, len(transform), length)), np.zeros(length)
-    corners = np.pad(np.diff(problem.input, 3), (2, 1)) ** 2
+    corners = np.pad(np.diff(problem.input, 4), 2) ** 2
     every = np.array([_GREATEST_GAIN_BEYOND * shifted, through])
     for edge in edges:
         part, count = slice(edge.start, edge.stop), edge.stop - edge.start
         effects[..., :count] += edge.height * every[..., part]
         weights[:count] += corners[part]
-    # One corner has two third differences of like size; either may be its place.
+    # One corner has two fourth differences of like size, before and after it.
     size = fit.gain * bound / (1 + _GREATEST_GAIN_BEYOND) / problem.period
     weights *= size**2 / 3 / (0.5 * np.sum(weights) or 1.0)
     return np.asarray(np.sum(effects * weights @ np.swapaxes(effects, 1, 2), axis=0))
