@@ -86,6 +86,7 @@ SOURCE_NAMES = {
     "x_late": "late latch of X",
     "x_backlash": "backlash of X",
     "positioning_x": "positioning error of X",
+    "positioning_x@waves": "periodic positioning error of X (screw)",
     "straightness_hysteresis": "straightness of X that depends on the direction",
     "probe_slope_fourth": "error of the probe on steep slopes",
     "probe_slope_moving": "error of the probe on slopes while Z moves",
@@ -130,7 +131,7 @@ def source_name(family: str) -> str:
     """Return the name of a family for people: ``spindle_axial/2@1`` → "…, 2 per turn, scan 2"."""
     name, _, scan = family.partition("@")
     base, _, order = name.partition("/")
-    text = SOURCE_NAMES.get(base, base.replace("_", " "))
+    text = SOURCE_NAMES.get(family) or SOURCE_NAMES.get(base, base.replace("_", " "))
     if order:
         text += f", {order} per turn" if base in SPINDLE else f", {order} Hz"
     return text + (f", scan {int(scan) + 1}" if scan.isdigit() else "")

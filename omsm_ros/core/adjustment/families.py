@@ -114,13 +114,8 @@ def families_of(ranges: Ranges, priors: Sequence[Source]) -> tuple[Family, ...]:
 
     Raises ConfigurationError for a declared source that is no family.
     """
-    found = [
-        *_dynamic(ranges),
-        *_geometric(ranges),
-        *_of_the_probe(ranges),
-        *_of_the_spindle(priors),
-        *_of_each_scan(ranges),
-    ]
+    found = [*_dynamic(ranges), *_geometric(ranges), *_of_the_probe(ranges),
+             *_of_the_spindle(priors), *_of_each_scan(ranges)]  # fmt: skip
     names = {base_name(f.name) for f in found} | set(_ELSEWHERE)
     for prior in priors:
         if prior.name not in names:
@@ -216,7 +211,10 @@ def _geometric(r: Ranges) -> list[Family]:
         _one("expansion", "1", lambda v: v.lateral_error(v.x, v.y), 3e-5, REFERENCE, 5e-6),
         _curve("positioning_x", "m", r.slide, r, lambda v, w: np.stack(
             [v.across(*way) for bow in w(v.slide_x) for way in ((bow, 0.0), (0.0, bow))]),
-            1e-5, beyond, 2, 5e-8),
+            1e-6, beyond, 2, 5e-8),
+        _curve(_WAVES, "m", r.slide, r, lambda v, w: np.stack(
+            [v.across(_SHARE * wave, 0.0) for wave in w(v.slide_x)]), 1e-5 / _SHARE, beyond, 1,
+            5e-8),
         _one("centre_x", "m", lambda v: v.across(1.0, 0.0), 2e-5, beyond),
         _one("centre_y", "m", lambda v: v.across(0.0, 1.0), 2e-5, beyond),
         Family("parallelism", "rad", 2, lambda v: np.stack(
@@ -234,9 +232,9 @@ def _geometric(r: Ranges) -> list[Family]:
 
 _OVER = (("straightness_x", "positioning_x", "straightness_hysteresis"),
          ("straightness_z", "pitch"))  # fmt: skip
-# A screw with a lead of 2 mm makes waves, which over a part of 25 mm have this length relative to
-# the way of X; of the position by a good scale they are a small share.
-_SHORT, _OF_WAVES = 0.08, 0.25
+# A screw makes waves along X, over a part of 25 mm as short as this relative to the way if its lead
+# is 2 mm. Of the position by a good scale, with which they are declared, they are a small share.
+_WAVES, _SHORT, _SHARE = "positioning_x@waves", 0.08, 0.25
 
 
 def _curve(
@@ -255,19 +253,18 @@ def _curve(
     ways: directions in which each component acts
     """
     # Curves over one axis are resolved alike, so that none explains what another cannot.
-    same = next(names for names in _OVER if name in names)
+    same = next(names for names in _OVER if base_name(name) in names)
     nodes = np.linspace(*ends, 129) if ends[1] > ends[0] else np.array([ends[0], ends[0] + 1.0])
     lengths = [length for n, length in r.lengths.items() if n in same]
-    length = min(lengths, default=(nodes[-1] - nodes[0]) / 2**0.5)
+    way = nodes[-1] - nodes[0]
+    length = _SHORT * way if name == _WAVES else min(lengths, default=way / 2**0.5)
     parts = components(smooth(length), nodes)
-    if name == "positioning_x":
-        waves = components(smooth(_SHORT * (nodes[-1] - nodes[0])), nodes)
-        parts = np.concatenate([parts, _OF_WAVES * waves])
     place = np.linspace(-1.0, 1.0, len(nodes))
-    if ways == 2:
-        # Their mean is the place of the spindle axis; the line of a position is the scale of its
-        # axis, and an angle of the part: sources of their own.
-        known = legendre.legvander(place, int(name == "positioning_x"))
+    # Their mean is the place of the spindle axis; the line of a position is the scale of its axis,
+    # and an angle of the part: sources of their own. Waves are what bends more than a cubic.
+    others = {"positioning_x": 1, "straightness_z": 0, _WAVES: 3}
+    if name in others:
+        known = legendre.legvander(place, others[name])
         parts = parts - (known @ np.linalg.lstsq(known, parts.T, rcond=None)[0]).T
 
     def over(position: FloatArray) -> FloatArray:

@@ -91,7 +91,7 @@ class Contribution:
 
 
 def base_name(family: str) -> str:
-    """Return the name of the declared source of ``family``, without the scan's number.
+    """Return the name of the declared source of ``family``, without number of a scan or "@waves".
 
     Lines in time have one declared source, at whatever frequency they stand.
     """

@@ -37,7 +37,7 @@ TWO_SCANS = [
         ("lag_by_z", "lag_motion", None),
         ("lag_by_x", "lag_x", None),
         ("warming", "drift_rate", None),
-        ("screw", "positioning_x", None),
+        ("screw", "positioning_x@waves", None),
     ),
 ]
 # Uncertainty that is left where an error in part looks like form: a lag that depends on the place
@@ -99,6 +99,17 @@ def test_two_scans_refute_and_correct(kind, family, true):
     alike = {n for r in found.refutations for n in r.alike}
     most = 150e-9 if "spindle_tilt/2" in alike else IN_PART_FORM_M.get(kind, 6e-9)
     assert found.form.mean_uncertainty < most
+
+
+@pytest.mark.parametrize("off", [{"centre_y": 10e-6}, *soaked({"centre_x": -10e-6})])
+def test_no_position_of_x_passes_for_a_centre_that_is_off(off):
+    """Where none is declared, neither a bow of the position nor waves are named with the centre."""
+    machine, made = drawn(0, 2, 0.8e-3, **off)
+    priors = [p for p in AS_DRAWN if p.name != "positioning_x"]
+    found = adjust(made, priors, nominal=MIRROR, accuracy=25e-9)
+    assert [r.name for r in found.refutations] == list(off)
+    assert not [n for n in found.refutations[0].alike if n.startswith("positioning_x")]
+    assert off_and_stated(machine, found)[1] < 1
 
 
 def off_and_stated(machine, found):
