@@ -33,7 +33,10 @@ def test_the_shortest_verifiable_set_that_reaches_is_chosen(capsys, nominal, tmp
     assert all(chosen["duration"] <= s["duration"] for s in reaching)
     assert len(found["sets"][-1]["scans"]) == 1
     reached = {s["name"]: s["expanded_uncertainty"] for s in found["sets"]}
-    assert reached["full"] < reached["quick"] < reached["single"]
+    # Each is by 300 draws, from which a standard deviation is known to 4 %.
+    assert reached["full"] < 1.1 * reached["quick"]
+    assert reached["quick"] < 0.5 * reached["single"]
+    assert reached["full_beyond"] < 0.7 * reached["full"]
 
 
 def test_where_no_set_reaches_the_accuracy_a_source_is_named(capsys, nominal, tmp_path):
