@@ -328,10 +328,10 @@ def test_a_connection_that_the_device_forgot_is_made_again_within_two_seconds(ce
     forgetful, before = run.instrument, run.delivered
     forgetful.receive, forgetful.streaming = lambda _: None, lambda: False
 
-    def remember() -> None:
+    def greeted() -> None:
         del forgetful.receive, forgetful.streaming, forgetful.greet
 
-    forgetful.greet = remember
+    forgetful.greet = greeted
     run.run(2.0)
     assert run.connections == 2
     assert run.delivered > before

@@ -106,7 +106,7 @@ def test_the_device_own_trouble_is_passed_on() -> None:
 
 
 def test_a_device_that_comes_back_at_any_time_is_connected_within_half_a_second() -> None:
-    """Whatever follows, a long pause between two connections does not delay it."""
+    """The pause between two attempts to connect is never longer."""
     waited: list[float] = []
 
     class Hurried(threading.Event):

@@ -233,7 +233,7 @@ def _geometric(r: Ranges) -> list[Family]:
 _OVER = (("straightness_x", "positioning_x", "straightness_hysteresis"),
          ("straightness_z", "pitch"))  # fmt: skip
 # A screw makes waves along X, over a part of 25 mm as short as this relative to the way if its lead
-# is 2 mm. Of the position by a good scale, with which they are declared, they are a small share.
+# is 2 mm. They are a small share of the position by a good scale, with which they are declared.
 _WAVES, _SHORT, _SHARE = "positioning_x@waves", 0.08, 0.25
 
 

@@ -30,7 +30,7 @@ from omsm_ros.instruments.counting import WireCounts
 
 # A counter that goes on by more jumps [samples].
 _NEAR = 16
-# So many telegrams with even steps of their counter confirm each other.
+# Telegrams in a row whose counters go on in even steps, which confirm each other.
 _ROW = 3
 # Matches a number in one way only; with more ways a long run of digits takes hours.
 _NUMBER_BYTES = rb"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
