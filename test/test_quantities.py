@@ -67,10 +67,6 @@ def test_either_sign_may_stand_before_a_signed_quantity() -> None:
         quantities.RADIUS.checked(0.0)
 
 
-@pytest.mark.parametrize("quantity", TABLE, ids=lambda q: q.name)
-def test_every_row_says_what_it_is(quantity: Quantity) -> None:
-    assert quantity.low < quantity.high
-    assert quantity.name
-    assert quantity.remedy
-    assert math.isfinite(quantity.low)
-    assert math.isfinite(quantity.high)
+def test_every_row_says_what_it_is() -> None:
+    assert all(q.name and q.remedy for q in TABLE)
+    assert not [q.name for q in TABLE if not -math.inf < q.low < q.high < math.inf]
