@@ -48,7 +48,8 @@ def cut(folder, tmp_path_factory):
     """Facts and folder of a compensation along a spiral."""
     out, said = tmp_path_factory.mktemp("compensation"), io.StringIO()
     with contextlib.redirect_stdout(said):
-        assert compensate(folder, out, "--low-pass", "0.004", "--spiral", "2e-4", "--json") == 0
+        words = ("--low-pass", "0.004", "--spiral", "4e-4", "--tool-radius", "0.005", "--json")
+        assert compensate(folder, out, *words) == 0
     return json.loads(said.getvalue()), out
 
 
@@ -134,11 +135,9 @@ def test_a_spiral_too_fine_for_a_controller_is_refused(folder, tmp_path, capsys)
     assert "take a wider feed" in capsys.readouterr().err
 
 
-def test_a_complete_program_is_written(folder, tmp_path, capsys):
-    words = ("--low-pass", "0.004", "--spiral", "1e-3", "--tool-radius", "0.005", "--json")
-    assert compensate(folder, tmp_path, *words) == 0
-    facts = json.loads(capsys.readouterr().out)
-    program = (tmp_path / "cut.nc").read_text().splitlines()
+def test_a_complete_program_is_written(cut):
+    facts, out = cut
+    program = (out / "cut.nc").read_text().splitlines()
     assert sum(line.startswith("G1 ") for line in program) > 500
     assert program[-1] == "M2"
     assert facts["path_error"] < 1e-7

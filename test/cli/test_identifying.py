@@ -132,7 +132,7 @@ def test_axes_that_a_bag_does_not_have_are_refused(capsys, tmp_path, axes):
 
 
 def test_duration_cuts_the_table(capsys, table, tmp_path):
-    arguments = ("--hold", "zero-order", "--duration", 30, "--out", tmp_path / "m.json", "--json")
+    arguments = ("--order", 2, "--duration", 30, "--out", tmp_path / "m.json", "--json")
     _, said = run(capsys, table, *COLUMNS, *arguments)
     assert json.loads(said.out)["samples"]["received"] == 300
 
@@ -143,7 +143,7 @@ def test_a_bag_behind_a_hold_gives_a_model_and_no_calibration(capsys, step_test,
         for axes, distance in blocks_of(step_test):
             writer.write_block(axes)
             writer.write_block(distance)
-    arguments = ("--hold", "zero-order", "--duration", 3, "--order", 2, "--max-delay", 0)
+    arguments = ("--hold", "zero-order", "--duration", 1, "--order", 2, "--max-delay", 0)
     run(capsys, bag, *arguments, "--out", tmp_path / "model.json", "--json")
     (path,) = tmp_path.glob("model*.json")
     model = json.loads(path.read_text())

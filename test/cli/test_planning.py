@@ -1,5 +1,7 @@
 """``omsm plan scans``: sets of scans with what they reach, and programs that follow the part."""
 
+import contextlib
+import io
 import json
 
 import numpy as np
@@ -39,24 +41,45 @@ def test_the_shortest_verifiable_set_that_reaches_is_chosen(capsys, nominal, tmp
     assert reached["full_beyond"] < 0.7 * reached["full"]
 
 
-def test_where_no_set_reaches_the_accuracy_a_source_is_named(capsys, nominal, tmp_path):
-    words = ("--nominal", nominal, "--out", tmp_path, "--radius", 3e-3, "--accuracy")
-    found = planned(capsys, *words, 1e-10)
-    assert not found["reaches"]
-    assert "the largest contribution is" in found["largest"]
-    assert planned(capsys, *words, 1e-6)["largest"] is None
+@pytest.fixture(scope="module", params=[(0.0, 1e-10), (1e-3, 1e-6)], ids=["within", "beyond"])
+def small(request, tmp_path_factory):
+    """Plan scans of 3 mm for a travel of X beyond the axis and an accuracy [m]."""
+    (travel, accuracy), folder = request.param, tmp_path_factory.mktemp("small")
+    write_nominal(folder / "mirror.yaml")
+    (folder / "limits.yaml").write_text(f"x_beyond: {travel}\n")
+    words = [
+        "plan",
+        "scans",
+        "--nominal",
+        folder / "mirror.yaml",
+        "--out",
+        folder,
+        "--radius",
+        3e-3,
+    ]
+    words += ["--limits", folder / "limits.yaml", "--accuracy", accuracy, "--json"]
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        assert cli.main([str(w) for w in words]) == 0
+    return travel, json.loads(said.getvalue()), folder
 
 
-def test_the_programs_follow_the_nominal_surface(capsys, nominal, tmp_path):
-    found = planned(capsys, "--nominal", nominal, "--out", tmp_path, "--radius", 3e-3)
-    table = np.genfromtxt(tmp_path / "scan_2.csv", delimiter=",", names=True)
+def test_where_no_set_reaches_the_accuracy_a_source_is_named(small):
+    travel, found, _ = small
+    assert found["reaches"] == (travel > 0)
+    assert (found["largest"] is None) == found["reaches"]
+    assert found["reaches"] or "the largest contribution is" in found["largest"]
+
+
+def test_the_programs_follow_the_nominal_surface(small):
+    _, found, folder = small
+    table = np.genfromtxt(folder / "scan_2.csv", delimiter=",", names=True)
     x, z, c = (table[name] for name in ("x_m", "z_m", "c_rad"))
     height = PAPER_MIRROR.height(x * np.cos(c), -x * np.sin(c))
     np.testing.assert_allclose(z, height, atol=1e-10)
     speed = np.diff(c) / np.diff(table["time_s"]) * 30 / np.pi
     scan = found["sets"][0]["scans"][1]
     np.testing.assert_allclose(speed, scan["rpm"], rtol=1e-3)
-    lines = (tmp_path / "scan_2.nc").read_text().splitlines()
+    lines = (folder / "scan_2.nc").read_text().splitlines()
     moves = [line for line in lines if line.startswith("G1")]
     assert len(moves) == len(x) - 1
     last = {word[0]: float(word[1:]) for word in moves[-1].split()}
@@ -81,15 +104,10 @@ def test_a_planned_motion_runs_at_its_speed_and_is_predicted(
     assert content == pytest.approx(3 * speed[0] / 60, abs=0.2)
 
 
-@pytest.mark.parametrize(("travel", "beyond"), [(0.0, False), (1e-3, True)])
-def test_a_slide_that_ends_at_the_axis_is_not_sent_beyond(
-    travel, beyond, capsys, nominal, tmp_path
-):
-    (tmp_path / "limits.yaml").write_text(f"x_beyond: {travel}\n")
-    words = ("--nominal", nominal, "--out", tmp_path, "--radius", 3e-3)
-    found = planned(capsys, *words, "--limits", tmp_path / "limits.yaml")
+def test_a_slide_that_ends_at_the_axis_is_not_sent_beyond(small):
+    travel, found, _ = small
     starts = [scan["start"] for one in found["sets"] for scan in one["scans"]]
-    assert (min(starts) < 0) == beyond
+    assert (min(starts) < 0) == (travel > 0)
 
 
 @pytest.mark.parametrize("what", ["scans", "motion"])

@@ -81,10 +81,11 @@ def test_a_grain_that_the_tracks_of_one_scan_alone_confirm_is_left_out(table):
         grain = 400e-9 * (np.abs(scan.x + 1j * scan.y - 1e-3 * np.exp(1j)) < 200e-6)
         seen.append(replace(scan, height=scan.height + grain, distance=scan.distance + grain))
     found = adjust(seen, exact_priors(), nominal=MIRROR, accuracy=25e-9)
-    clean = adjust([inwards, beyond], exact_priors(), nominal=MIRROR, accuracy=25e-9)
     assert not found.refutations
-    assert found.verdict.code == clean.verdict.code
-    assert found.form.pv.value == pytest.approx(clean.form.pv.value, abs=2e-9)
+    assert found.verdict.code == NOT_VERIFIED
+    pv, _, _, _, error = normalised(machine, found)
+    assert abs(pv) < 2
+    assert error < 2 * found.form.mean_uncertainty < 8e-9
 
 
 def test_what_three_speeds_show_is_advised_after_two(table):

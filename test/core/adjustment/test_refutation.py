@@ -121,7 +121,7 @@ def off_and_stated(machine, found):
 @pytest.mark.parametrize("half", [40e-9, *soaked(15e-9, 120e-9)])
 def test_a_backlash_is_found_with_its_width(half):
     """At each reversal, and near the centre, the probe stands still until the gap is passed."""
-    machine, made = drawn(0, 2, play=half)
+    machine, made = drawn(0, 2, 0.8e-3, play=half)
     found = adjust(made, AS_DRAWN, nominal=MIRROR, accuracy=25e-9)
     assert [r.name for r in found.refutations] == ["motion_error"]
     assert abs(found.source("motion_error").found[0]) == pytest.approx(half, rel=0.05)
@@ -139,7 +139,7 @@ def test_a_clamp_that_relaxes_is_named_and_leaves_the_form_uncertain():
 
 
 def test_a_spindle_centre_that_moved_between_scans_is_named():
-    machine, made = drawn(0, 1)
+    machine, made = drawn(0, 1, 0.8e-3)
     second = machine.scan(60.0, outward=True, centre_x=2e-6, centre_y=-4e-6)
     found = adjust([*made, second], AS_DRAWN, nominal=MIRROR, accuracy=25e-9)
     cause = found.refutations[0]
@@ -250,7 +250,7 @@ def test_an_accepted_value_refutes_no_more():
 
 def test_a_clocking_that_was_declared_counts_as_the_source_that_it_is():
     """A freeform turned on the chuck looks like form, so the light and the advice name it."""
-    _, made = drawn(4, 2)
+    _, made = drawn(4, 2, 0.8e-3)
     priors = [p for p in AS_DRAWN if p.name != "clocking"]
     found = adjust(made, [*priors, Source("clocking", 1e-4, evaluated=True)], nominal=MIRROR,
                    accuracy=25e-9)  # fmt: skip
@@ -266,12 +266,13 @@ def named(found):
 
 def test_an_error_of_the_direction_without_a_width_is_named_alone():
     """30 nm with the sign of the rate of Z: a backlash as wide would leave waves of the spindle."""
-    _, found = disturbed("backlash", 2)
+    _, made = drawn(0, 2, 0.8e-3, **KINDS["backlash"])
+    found = adjust(made, AS_DRAWN, nominal=MIRROR, accuracy=25e-9)
     assert named(found) == [("motion_error",)]
 
 
 def test_a_creep_over_many_seconds_is_a_creep():
     """Its time constant is 8 s, of which the step test shows nothing."""
-    _, made = drawn(0, 2, slow_creep=3e-4)
+    _, made = drawn(0, 2, 0.8e-3, slow_creep=3e-4)
     found = adjust(made, AS_DRAWN, nominal=MIRROR, accuracy=25e-9)
     assert "creep" in named(found)[0]

@@ -43,7 +43,7 @@ def test_the_closed_form_starts_at_rest():
 
 
 def step_test(
-    dither=1.0, response=mode_step, axis=axis_step, edges=20, dwell=100, seed=4, rounded=False
+    dither=1.0, response=mode_step, axis=axis_step, edges=20, dwell=60, seed=4, rounded=False
 ):
     """A step test; ``rounded``: an encoder without noise in whole nanometres."""
     random = np.random.default_rng(seed)

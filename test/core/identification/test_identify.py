@@ -26,8 +26,9 @@ from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 from .recorded_motions import TRUTH, errors, from_noise, identified, record_of, recorded, resonance
 
 
-def test_an_identification_can_be_sent_to_another_process():
-    found = identify(record_of(recorded()))
+def test_an_identification_with_its_settings_can_be_sent_to_another_process():
+    found = identify(record_of(recorded()), settings={"exposure_s": 1e-4})
+    assert found.calibration.settings == {"exposure_s": 1e-4}
     received = pickle.loads(pickle.dumps(found))
     assert received.calibration.id == found.calibration.id
     assert received.fit.rms == found.fit.rms
@@ -111,10 +112,6 @@ class TestStepTest:
         parts = blocks_of(recorded(), 137)
         cut = identify(assemble([a for a, _ in parts], [d for _, d in parts][::-1])).calibration
         assert cut.content() == identified().content()
-
-    def test_settings_are_kept(self):
-        calibration = identify(record_of(recorded()), settings={"exposure_s": 1e-4}).calibration
-        assert calibration.settings == {"exposure_s": 1e-4}
 
 
 class TestOtherMotions:

@@ -146,15 +146,15 @@ def test_an_aperture_of_the_nominal_surface_counts(text):
 
 
 def test_a_disc_off_the_origin_ends_at_its_points():
-    """A flat turned up by 200 nm at its rim, scanned on the axis, and one and three tracks off."""
+    """A flat turned up by 200 nm at its rim, scanned on the axis, and three tracks off."""
     r, c = np.linspace(0, 5e-3, 4000), np.linspace(0, 100 * np.pi, 4000)
     height = 200e-9 * np.clip(r / 5e-3 - 0.8, 0, None) ** 2 / 0.04
     found = []
-    for shift in (0.0, 0.1e-3, 0.3e-3):
+    for shift in (0.0, 0.3e-3):
         batch = PointBatch(r * np.cos(c) + shift, r * np.sin(c), height, np.empty((0, len(r))))
         found.append(analyse_form(Flat(), lambda batch=batch: [batch], ("piston", "tip", "tilt")))
     # The end of the outermost turn lies a track within the rim.
-    assert (found[2].aperture.x, found[2].aperture.radius) == pytest.approx(
+    assert (found[1].aperture.x, found[1].aperture.radius) == pytest.approx(
         (0.3e-3, 5e-3), abs=5e-5
     )
     within = np.linspace(0, 1, 10_001)
