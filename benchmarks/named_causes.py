@@ -66,7 +66,7 @@ _WORDS = {"nonlinear scale of the probe": "linearity", "periodic error": "period
 
 def _causes(finding: Finding) -> tuple[str, ...]:
     """Return the causes that a finding names as possible ones, none for others."""
-    subject = finding.code.partition(".")[2].removeprefix("unmodelled_")
+    subject = finding.code.partition(".")[2]
     if subject == "undecided":
         causes = finding.values["causes"]
         assert isinstance(causes, list)

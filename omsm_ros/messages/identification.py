@@ -11,9 +11,7 @@ linearity: a nonlinear scale of the probe, {size_m:m} at the ends of its range
 periodic: an error of {size_m:m} periodic in {period_m:m} of travel
 vibration: vibration of {size_m:m} at {frequency_hz:Hz/4}, or at its alias {alias_hz:Hz/4}
 drift: drift of {size_m:m} rms during the test, or the beginning of a relaxation
-stiffening: a stiffness that grows with the deflection
 """)
-# Remedies at the machine for each model error.
 _REMEDIES = catalogue("""
 creep: let the joints of probe and target settle, and rest longer on each plateau
 mode: look for a loose part, and for what the machine stands on
@@ -23,9 +21,7 @@ linearity: use less of the range of the probe, or linearise the probe
 periodic: make steps that are no multiple of that period
 vibration: find what runs at this frequency, or isolate the machine from it
 drift: let the machine warm up and its joints settle, and shield it
-stiffening: make smaller steps, as large as the deflections of a scan
 """)
-_IN_RESPONSE = ("creep", "mode")
 
 TEMPLATES = catalogue("""
 # Model errors that were found.
@@ -119,6 +115,8 @@ identification.wrong_order: where the axis moves the residual is {chi_square:pla
 identification.residual_of_axis_timing: where the axis moves the residual is {chi_square:plain}
     times the noise of {noise_m:m} squared: the readings of the axis scatter in time by
     {scatter_s:s}; latch encoder and probe by one trigger, and repeat the test
+identification.stiffening: the residual shows a stiffness that grows with the deflection (by chance:
+    {p:chance}): make smaller steps, as large as the deflections of a scan, and repeat the test
 identification.dependent_residual: the residual follows the motion (by chance: {p:chance}): the
     machine does not answer linearly, or differently each time; look for a part that is loose or
     rubs, and compare with smaller steps
@@ -149,12 +147,7 @@ identification.unknown_prior: settings: the prior of {family} is unknown, expect
 identification.prior: settings: the prior of {family!r} is {value}, expected a positive number
 """)
 for _name, _words in _NAMES.items():
-    _where = "part of" if _name in _IN_RESPONSE else "modelled in addition to"
+    _where = "part of" if _name in ("creep", "mode") else "modelled in addition to"
     TEMPLATES[f"identification.{_name}"] = (
         f"{_words}; it is {_where} the response: {_REMEDIES[_name]}"
     )
-    TEMPLATES[f"identification.unmodelled_{_name}"] = (
-        f"the residual shows {_words} (by chance: {{p:chance}}) that no model describes: "
-        f"{_REMEDIES[_name]}, and repeat the test"
-    )
-del TEMPLATES["identification.stiffening"]  # it has no model

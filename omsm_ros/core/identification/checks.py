@@ -43,7 +43,6 @@ from omsm_ros.core.model_errors.families import (
     LINEARITY,
     MODE,
     PERIODIC,
-    STIFFENING,
     VIBRATION,
     ModelErrorTerm,
 )
@@ -155,10 +154,9 @@ def searched(e: IdentificationEvidence) -> Findings:
 
 def independence(e: IdentificationEvidence) -> Findings:
     """Reject a residual that follows the rate of the motion; scatter in time may conceal it."""
-    p_value = e.searched.diagnostics.independence
-    if p_value >= FALSE_ALARM:
+    if e.searched.p_value >= FALSE_ALARM:
         return
-    code, values = "identification.dependent_residual", {"p": p_value}
+    code, values = "identification.dependent_residual", {"p": e.searched.p_value}
     scatter = max(e.residual.timing, e.residual.axis_timing)
     if scatter > 0:
         code, values["scatter_s"] = "identification.dependent_by_timing", scatter
@@ -282,17 +280,15 @@ def requested_order(e: IdentificationEvidence) -> Findings:
 # friction lag by their whole half widths together; drift and linearity are no errors of motion.
 _PER_SIZE = {PERIODIC: 0.5**0.5, VIBRATION: 0.5**0.5}
 _AT_REVERSALS = (BACKLASH, FRICTION)
-# Codes of a model error: found and modelled, and found only. Stiffening has no model.
-_CODES = {
-    BACKLASH: ("identification.backlash", "identification.unmodelled_backlash"),
-    FRICTION: ("identification.friction", "identification.unmodelled_friction"),
-    LINEARITY: ("identification.linearity", "identification.unmodelled_linearity"),
-    PERIODIC: ("identification.periodic", "identification.unmodelled_periodic"),
-    VIBRATION: ("identification.vibration", "identification.unmodelled_vibration"),
-    DRIFT: ("identification.drift", "identification.unmodelled_drift"),
-    CREEP: ("identification.creep", "identification.unmodelled_creep"),
-    MODE: ("identification.mode", "identification.unmodelled_mode"),
-    STIFFENING: ("", "identification.unmodelled_stiffening"),
+_MODELLED_CODES = {
+    BACKLASH: "identification.backlash",
+    FRICTION: "identification.friction",
+    LINEARITY: "identification.linearity",
+    PERIODIC: "identification.periodic",
+    VIBRATION: "identification.vibration",
+    DRIFT: "identification.drift",
+    CREEP: "identification.creep",
+    MODE: "identification.mode",
 }
 # Families of which one may explain the residual of another, as causes in words.
 _MAY_LOOK_ALIKE = {
@@ -326,15 +322,14 @@ class Size:
 
 
 def model_errors(searched: SearchResult) -> Findings:
-    """Yield a reservation for each deviation that was modelled, a rejection for each other one."""
-    period = searched.prepared.problem.period
-    for judged in searched.unmodelled:
-        size = float(np.linalg.norm(judged.score.size))
-        values = _values(judged.term, size, period)
-        values["p"] = float(np.exp(max(judged.log_p, -690)))
+    """Yield a rejection for a deviation without a model, else a reservation for each other."""
+    if searched.stiffening is not None:
+        # Terms that were fitted without it may only imitate it.
+        chance = float(np.exp(max(searched.stiffening.log_p, -690)))
         limits = {"false_alarm_p": FALSE_ALARM}
-        yield Finding(_CODES[judged.term.family][1], REJECTS, values, limits)
-    sizes, _ = _sizes(searched)
+        yield Finding("identification.stiffening", REJECTS, {"p": chance}, limits)
+        return
+    sizes, period = _sizes(searched)[0], searched.prepared.problem.period
     pairs = zip(searched.nuisance_terms, sizes, strict=True)
     shown = [(modelled, found.value) for modelled, found in pairs if found.significant]
     drifts = any(modelled.term.family == DRIFT for modelled, _ in shown)
@@ -344,15 +339,14 @@ def model_errors(searched: SearchResult) -> Findings:
         slow = term.parameter * searched.diagnostics.plateau < 1
         if drifts and slow and term.family == VIBRATION:
             continue
-        code, values = _CODES[term.family][0], _values(term, size, period)
+        code, values = _MODELLED_CODES[term.family], _values(term, size, period)
         alike = _alike(searched, modelled) if term.family in _MAY_LOOK_ALIKE else []
         if alike:
             code = "identification.undecided"
             values["causes"] = [_MAY_LOOK_ALIKE[name] for name in (term.family, *alike)]
         yield Finding(code, RESERVATION, values)
     for term in searched.added_poles:
-        values = _values(term, None, period)
-        yield Finding(_CODES[term.family][0], RESERVATION, values)
+        yield Finding(_MODELLED_CODES[term.family], RESERVATION, _values(term, None, period))
 
 
 def _alike(searched: SearchResult, modelled: ModelledTerm) -> list[str]:

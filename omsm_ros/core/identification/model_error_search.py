@@ -26,6 +26,7 @@ from omsm_ros.core.model_errors.families import (
     LINEARITY,
     MODE,
     PERIODIC,
+    STIFFENING,
     VIBRATION,
     ModelErrorTerm,
 )
@@ -34,6 +35,7 @@ from omsm_ros.core.model_errors.undetected import at_fitted_pole, fit_with_added
 
 # Rounds, each for one model error; a machine with more errors cannot be used to measure.
 _MOST_ROUNDS = 6
+_POLES = {CREEP, MODE}
 _NUISANCE_FAMILIES = {BACKLASH, DRIFT, FRICTION, LINEARITY, PERIODIC, VIBRATION}
 # Families whose columns depend on the fitted response, and improve it.
 _TURNING = {BACKLASH, FRICTION}
@@ -57,7 +59,8 @@ class SearchResult:
     """The result of the search.
 
     nuisance_terms: model errors in the background;  added_poles: those that became poles
-    unmodelled: significant, but without a model;  diagnostics: of the last fit
+    stiffening: a stiffness that grows, which has no model;  diagnostics: of the last fit
+    p_value: least chance of all else by which the residual follows the motion
     without: diagnostics of the fit before each of ``added_poles`` was added
     incomplete: the search was cut short, because its budget was exhausted
     """
@@ -67,7 +70,8 @@ class SearchResult:
     diagnostics: ResidualDiagnostics
     nuisance_terms: Sequence[ModelledTerm] = ()
     added_poles: Sequence[ModelErrorTerm] = ()
-    unmodelled: Sequence[ScoreTest] = ()
+    stiffening: ScoreTest | None = None
+    p_value: float = 1.0
     without: Sequence[ResidualDiagnostics] = ()
     incomplete: bool = False
 
@@ -88,23 +92,30 @@ def search_model_errors(
     budget: of all evaluations, None for the default
     may_grow: poles may be added to the model
     """
-    search = _Search(choose, *_initial_model(prepared, choose, budget or EvaluationBudget()))
-    search.refused |= set() if may_grow else {CREEP, MODE}
+    started = _initial_model(prepared, choose, budget or EvaluationBudget())
+    search = _Search(choose, *started, refused=set() if may_grow else {*_POLES})
     diagnostics = search.diagnostics()
     for _ in range(_MOST_ROUNDS):
-        shown = diagnostics.significant(search.refused | search.settled)
+        shown = list(filter(search.new, diagnostics.significant(search.refused | search.settled)))
+        # Whatever is added after a stiffness that grows, which has no model, would imitate it.
+        if not shown or shown[0].term.family == STIFFENING:
+            break
         # Without budget a nuisance term is still fitted to the structure that was chosen.
-        if not shown or (search.budget.stops() and shown[0].term.family not in _NUISANCE_FAMILIES):
+        if search.budget.stops() and shown[0].term.family in _POLES:
             break
         if search.add(diagnostics, shown):
             diagnostics = search.diagnostics()
+    left = diagnostics.significant(search.settled)
+    # What has a model was tried, or the search did not come to it: it names no cause.
+    stiffening = left[0] if left and left[0].term.family == STIFFENING else None
     return SearchResult(
         search.prepared,
         search.model,
         diagnostics,
         search.nuisance_terms,
         search.grown,
-        diagnostics.significant(search.settled),
+        stiffening,
+        min([diagnostics.independence] + [float(np.exp(j.log_p)) for j in left if j != stiffening]),
         search.without,
         incomplete=search.budget.incomplete,
     )
@@ -166,6 +177,13 @@ class _Search:
         self.prepared, self.model = self.choose(self.prepared, self.budget, before)
         return True
 
+    def new(self, judged: ScoreTest) -> bool:
+        """Return whether no nuisance term has its period, to a cycle: two could cancel."""
+        known = [m.term.parameter for m in self.nuisance_terms if m.term.family == PERIODIC]
+        apart = 1 / np.array(known) - 1 / (judged.term.parameter or np.inf)
+        cycles = np.abs(apart) * np.ptp(self.prepared.problem.input)
+        return judged.term.family != PERIODIC or bool(np.all(cycles >= 1))
+
 
 def _initial_model(
     prepared: Prepared, choose: Choose, budget: EvaluationBudget
@@ -209,8 +227,7 @@ def _drift(prepared: Prepared, budget: EvaluationBudget) -> list[ScoreTest]:
     A nonlinear scale of the probe competes with it: steps that climb and return make both alike.
     """
     problem = prepared.problem
-    start, part = [np.array([0.1])], problem.sums
-    lag = fit(problem, Structure(0, 0, True), start, budget=budget, part=part)
+    lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget, part=problem.sums)
     diagnostics = ResidualDiagnostics(problem, lag, prepared.steps, (CREEP, DRIFT, LINEARITY))
     # If the decimated record shows none, all samples need not be tested.
     for each in filter(None, (diagnostics.thinned, diagnostics)):
@@ -250,10 +267,8 @@ def _improving_terms(
     problem = _with_columns(before, columns)[0].problem
     nuisance_terms = fit(problem, plain.structure, [plain.nonlinear], budget=budget)
     further = problem.background.shape[1] - diagnostics.problem.background.shape[1]
-    better = information(nuisance_terms) + further * np.log(nuisance_terms.samples) < information(
-        rival
-    )
-    return columns if better else []
+    cost = information(nuisance_terms) + further * np.log(nuisance_terms.samples)
+    return columns if cost < information(rival) else []
 
 
 def _select_nuisance_terms(
@@ -295,8 +310,6 @@ def _with_columns(
 def _grown(
     prepared: Prepared, model: ChosenModel, term: ModelErrorTerm, budget: EvaluationBudget
 ) -> tuple[Prepared, ChosenModel] | None:
-    if term.family not in (CREEP, MODE):
-        return None
     problem, new = prepared.problem, poles_of(term)
     duration = len(problem.input) * problem.period
     if term.family == CREEP or np.min(-new.real) * duration < OVER:
