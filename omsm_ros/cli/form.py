@@ -203,11 +203,9 @@ def _declare_form(add: Arguments) -> None:
     add("--no-report", None, "write results without a report")
     for name, what in (("s", "shorter"), ("l", "longer")):
         add(
-            f"--{name}-filter",
-            SPACING,
-            f"remove {what} wavelengths from the texture [m] (ISO 25178)",
-            metavar="WAVELENGTH",
-        )
+            f"--{name}-filter", SPACING,
+            f"remove {what} wavelengths from the texture [m] (ISO 25178)", metavar="WAVELENGTH",
+        )  # fmt: skip
 
 
 def _form(args: argparse.Namespace) -> Facts:
@@ -319,18 +317,12 @@ def _write_cut(form: FormResult, args: argparse.Namespace, out: Path) -> Facts:
     offset, spread = np.abs(found.offset[known]), found.uncertainty[known]
     sure = float(np.mean(offset > _COVERAGE * spread))
     return path | {
-        "file": COMPENSATION,
-        "places": int(np.sum(known)),
-        "low_pass": args.low_pass,
-        "removed": list(form.registration.dofs.fitted),
-        "rms_before": found.before,
-        "rms_after": found.after,
-        "largest_offset": float(np.max(offset)),
-        "largest_uncertainty": float(np.max(spread)),
-        "significant_share": sure,
-        "last_cut": share,
+        "file": COMPENSATION, "places": int(np.sum(known)), "low_pass": args.low_pass,
+        "removed": list(form.registration.dofs.fitted), "rms_before": found.before,
+        "rms_after": found.after, "largest_offset": float(np.max(offset)),
+        "largest_uncertainty": float(np.max(spread)), "significant_share": sure, "last_cut": share,
         "warnings": _warnings(sure, found.before, found.after),
-    }
+    }  # fmt: skip
 
 
 def _show_compensate(facts: Facts) -> Rows:

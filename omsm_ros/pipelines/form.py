@@ -80,17 +80,10 @@ class OpenedMeasurement:
     def form(self, surface: Surface, how: RegistrationOptions) -> FormResult:
         """Return the form of the points against ``surface``."""
         return analyse_form(
-            surface,
-            self.portions,
-            how.dofs,
-            sources=self.sources,
-            bounds=self.bounds,
-            aperture=how.aperture,
-            even=self.even,
-            filters=how.filters,
-            dust=ISOLATED if how.dust is None else how.dust,
-            declared=how.placement or {},
-        )
+            surface, self.portions, how.dofs, sources=self.sources, bounds=self.bounds,
+            aperture=how.aperture, even=self.even, filters=how.filters,
+            dust=ISOLATED if how.dust is None else how.dust, declared=how.placement or {},
+        )  # fmt: skip
 
 
 def open_measurement(

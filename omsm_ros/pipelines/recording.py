@@ -147,17 +147,10 @@ def scan_data(
     known = np.isfinite(z) & np.isfinite(c) & np.isfinite(made.height)
     made, z, c = made.part(known), z[known], np.unwrap(c[known])
     data = ScanData(
-        time=(made.sample - made.sample[0]) * period if len(made) else np.empty(0),
-        x=made.x,
-        y=made.y,
-        height=made.height,
-        distance=made.height - z + made.dynamic_error,
-        motion=z,
-        removed=made.dynamic_error,
-        c=c,
-        clocking=clocking,
-        clamping=clamping,
-    )
+        time=(made.sample - made.sample[0]) * period if len(made) else np.empty(0), x=made.x,
+        y=made.y, height=made.height, distance=made.height - z + made.dynamic_error, motion=z,
+        removed=made.dynamic_error, c=c, clocking=clocking, clamping=clamping,
+    )  # fmt: skip
     return data, made
 
 

@@ -273,24 +273,17 @@ def _peak_facts(studied: StudiedScan, row: NamedLine) -> dict[str, Any]:
     possible = line.possible
     place = studied.coordinates[line.coordinate]
     return {
-        "kind": row.kind,
-        "also": row.also or None,
-        "frequency": possible.get(TIME),
+        "kind": row.kind, "also": row.also or None, "frequency": possible.get(TIME),
         "frequency_uncertainty": line.frequency_uncertainty * place.pace,
         "wavelength_along_path": _over(possible.get(PATH)),
-        "wavelength_along_radius": _over(possible.get(RADIUS)),
-        "per_turn": possible.get(TURN),
-        "sharpest_in": line.coordinate,
-        "amplitude": line.amplitude,
-        "amplitude_uncertainty": line.amplitude_uncertainty,
-        "rms": line.amplitude / 2**0.5,
-        "significance": line.significance,
-        "true_frequency": row.frequency,
-        "true_wavelength": row.wavelength,
-        "order": row.order,
+        "wavelength_along_radius": _over(possible.get(RADIUS)), "per_turn": possible.get(TURN),
+        "sharpest_in": line.coordinate, "amplitude": line.amplitude,
+        "amplitude_uncertainty": line.amplitude_uncertainty, "rms": line.amplitude / 2**0.5,
+        "significance": line.significance, "true_frequency": row.frequency,
+        "true_wavelength": row.wavelength, "order": row.order,
         "evidence": [*map(str, row.evidence)],
         "needs": None if row.needs is None else str(row.needs),
-    }
+    }  # fmt: skip
 
 
 def _on_the_part(

@@ -165,16 +165,11 @@ def judge(
     drawn = _monte_carlo_errors(matched, errors, shared)
     farthest = np.max(np.abs(drawn[0] - drawn[1]) / uncertainty, axis=1)
     return ComparisonAgreement(
-        figures=_figures(matched, drawn),
-        terms=terms,
-        probability=probability,
-        within=float(np.mean(score < COVERAGE_FACTOR)),
-        uncertainty=uncertainty,
-        farthest=float(score[worst]),
-        allowed=float(np.percentile(farthest, _PERCENTILE)),
-        at=(float(matched.x[worst]), float(matched.y[worst])),
-        aperture=aperture,
-    )
+        figures=_figures(matched, drawn), terms=terms, probability=probability,
+        within=float(np.mean(score < COVERAGE_FACTOR)), uncertainty=uncertainty,
+        farthest=float(score[worst]), allowed=float(np.percentile(farthest, _PERCENTILE)),
+        at=(float(matched.x[worst]), float(matched.y[worst])), aperture=aperture,
+    )  # fmt: skip
 
 
 def _figures(matched: Matched, drawn: Sequence[FloatArray]) -> dict[str, ComparedFigure]:

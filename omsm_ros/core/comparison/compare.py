@@ -87,15 +87,9 @@ def _differences(found: ComparisonAgreement) -> tuple[Notice, ...]:
     both = abs(largest.e_n) > 1 and probability < _UNLIKELY
     reasons = []
     if plainly or both:
-        reasons.append(
-            Notice(
-                "comparison.term_differs",
-                term=(largest.n, largest.m),
-                difference=largest.difference,
-                expanded=largest.expanded,
-                e_n=largest.e_n,
-            )
-        )
+        n_m, e_n = (largest.n, largest.m), largest.e_n
+        size = {"difference": largest.difference, "expanded": largest.expanded, "e_n": e_n}
+        reasons.append(Notice("comparison.term_differs", term=n_m, **size))
     if probability < _LEAST_PROBABILITY or both:
         reasons.append(Notice("comparison.improbable", p=probability))
     if found.farthest > _CLEARLY_BEYOND * found.allowed:
@@ -214,16 +208,10 @@ def compare_measurements_of_part(
     shared = min(float(np.sum(matched.filled)) / own, 1.0)
     verdict, reasons = verdict_of(matched, agreement, unknown, shared)
     return Comparison(
-        matched=matched,
-        sides=sides,
-        agreement=agreement,
-        shared=shared,
-        length=reach,
-        common=common,
-        verdict=verdict,
-        reasons=reasons,
+        matched=matched, sides=sides, agreement=agreement, shared=shared, length=reach,
+        common=common, verdict=verdict, reasons=reasons,
         reservations=_reservations(sides, matched),
-    )
+    )  # fmt: skip
 
 
 def _places(a: MeasuredPoints, b: MeasuredPoints, side: float) -> HeightGrid:
@@ -234,12 +222,9 @@ def _places(a: MeasuredPoints, b: MeasuredPoints, side: float) -> HeightGrid:
     counts = [int((h - c) / side) + 1 for c, h in zip(low, high, strict=True)]
     if max(counts) > _MOST_PLACES or counts[0] * counts[1] > _MOST_PLACES:
         raise DataError(
-            "comparison.too_many_places",
-            spacing=side,
-            columns=counts[0],
-            rows=counts[1],
+            "comparison.too_many_places", spacing=side, columns=counts[0], rows=counts[1],
             most=_MOST_PLACES,
-        )
+        )  # fmt: skip
     x0, y0 = (c + (h - c) % side / 2 for c, h in zip(low, high, strict=True))
     return HeightGrid(height=np.zeros(counts[::-1]), x0=x0, y0=y0, dx=side, dy=side)
 
@@ -256,15 +241,10 @@ def _side(
     m = half.measurement
     estimated = m.drift_from == ESTIMATED and agreement is None
     return SideSummary(
-        name=m.name,
-        points=len(m.points),
-        scatter=half.surface.scatter,
-        sources=sources,
-        drift=drift_size(errors),
-        drift_from=NOT_KNOWN if estimated else m.drift_from,
-        interpolation=half.interpolation,
-        cell=half.surface.cell,
-    )
+        name=m.name, points=len(m.points), scatter=half.surface.scatter, sources=sources,
+        drift=drift_size(errors), drift_from=NOT_KNOWN if estimated else m.drift_from,
+        interpolation=half.interpolation, cell=half.surface.cell,
+    )  # fmt: skip
 
 
 def _reservations(sides: tuple[SideSummary, SideSummary], matched: Matched) -> tuple[Notice, ...]:

@@ -86,11 +86,9 @@ class Matched:
         flat = np.full(self.grid.height.size, np.nan)
         flat[self.filled] = self.a - self.b - level
         return replace(
-            self,
-            grid=replace(self.grid, height=flat.reshape(self.grid.height.shape)),
-            b=self.b + level,
-            moved={**self.moved, **step},
-        )
+            self, grid=replace(self.grid, height=flat.reshape(self.grid.height.shape)),
+            b=self.b + level, moved={**self.moved, **step},
+        )  # fmt: skip
 
     def without_fit(self, values: FloatArray) -> FloatArray:
         """Return values (…, m) without their fit by the fitted pose parameters."""

@@ -114,16 +114,9 @@ def averaged(
     dx, dy = points.x - x[cell], points.y - y[cell]
     spread = np.full(len(points), np.nan) if points.uncertainty is None else points.uncertainty
     cells = AveragedCells(
-        x=x,
-        y=y,
-        height=mean(height),
-        xx=mean(dx * dx),
-        xy=mean(dx * dy),
-        yy=mean(dy * dy),
-        variance=mean(spread**2),
-        order=mean(_order(points)),
-        points=count.astype(np.float64),
-    )
+        x=x, y=y, height=mean(height), xx=mean(dx * dx), xy=mean(dx * dy), yy=mean(dy * dy),
+        variance=mean(spread**2), order=mean(_order(points)), points=count.astype(np.float64),
+    )  # fmt: skip
     return cells, np.asarray(cell, np.int64)
 
 

@@ -8,6 +8,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from omsm_ros.core.form import texture
 from omsm_ros.core.form.deviation_map import (
     DeviationMap,
     Doubt,
@@ -33,16 +34,6 @@ from omsm_ros.core.form.part_figures import (
     length,
     rms_of_part,
     short_waves,
-)
-from omsm_ros.core.form.texture import (
-    Bands,
-    PowerDensity,
-    UncertainCurve,
-    bands_of,
-    edge_roll_off,
-    power_density,
-    profiles,
-    texture,
 )
 from omsm_ros.core.form.zernike_fit import RimStrip, ZernikeFit, fit_zernikes
 from omsm_ros.core.kinematics.kinematics import Surface
@@ -175,9 +166,9 @@ class FormResult:
     map: DeviationMap
     deviation: dict[str, UncertainValue]
     zernike: ZernikeFit
-    bands: Bands
-    profiles: dict[str, UncertainCurve]
-    density: PowerDensity
+    bands: texture.Bands
+    profiles: dict[str, texture.UncertainCurve]
+    density: texture.PowerDensity
     counts: dict[str, int]
     dust: FloatArray
     uncovered: float
@@ -229,21 +220,22 @@ def analyse_form(
     )  # fmt: skip
     zernike = with_pose_uncertainty(fit, map_, found)
     cells = GridCells.of(map_, even=even)
-    bands = bands_of(cells, *filters)
-    gaps = Gaps.of(map_, outline, found.spacing, None if outline.outline == "annulus" else strip)
-    del strip  # it is as large as the map
+    bands = texture.bands_of(cells, *filters)
+    of_rim, guess = None if outline.outline == "annulus" else strip, aperture is None
+    gaps = Gaps.of(map_, outline, found.spacing, of_rim, guessed=guess, uncovered=uncovered)
+    del strip, of_rim  # it is as large as the map
     figures, textures = _figures(smooth, zernike, cells, bands, outline, even, gaps)
     return FormResult(
         registration=found, aperture=outline, map=map_, zernike=zernike, bands=bands,
         deviation=figures | gathered.as_measured(map_) | textures,
-        profiles=profiles(map_, found.disc), density=power_density(cells),
+        profiles=texture.profiles(map_, found.disc), density=texture.power_density(cells),
         counts=gathered.counts, dust=gathered.dust, uncovered=uncovered,
     )  # fmt: skip
 
 
 def _figures(
-    smooth: SmoothTerms, zernike: ZernikeFit, cells: GridCells, bands: Bands, outline: Aperture,
-    even: bool, gaps: Gaps | None,
+    smooth: SmoothTerms, zernike: ZernikeFit, cells: GridCells, bands: texture.Bands,
+    outline: Aperture, even: bool, gaps: Gaps | None,
 ) -> tuple[dict[str, UncertainValue], dict[str, UncertainValue]]:  # fmt: skip
     """Return figures of the map, and its texture with slopes;  cells: of it."""
     map_, rest = smooth.map, smooth.without(SECOND_ORDER)
@@ -256,7 +248,7 @@ def _figures(
         # Irregularity: the peak to valley without piston, tilts and power.
         "iso10110_B": extents[3][0],
         "robust_peak_to_valley": extents[0][1],
-        "edge_roll_off": edge_roll_off(map_, outline),
+        "edge_roll_off": texture.edge_roll_off(map_, outline),
     }
     for k, name in enumerate(("", "_best_fit", "_without_second_order")):
         figures |= {f"peak_to_valley{name}": extents[k][0], f"rms{name}": sizes[k]}
@@ -264,9 +256,9 @@ def _figures(
     formless = GridCells.of(points, even=even)
     # Without an S-filter the surface has waves that the cells do not resolve.
     if cells.width == 0 or bands.s_filter is not None:
-        return figures, texture(cells, formless, bands, None, rest_cells)
+        return figures, texture.texture(cells, formless, bands, None, rest_cells)
     points = short_waves(points, formless, bands.l_filter)
-    textures = texture(cells, formless, bands, points, rest_cells)
+    textures = texture.texture(cells, formless, bands, points, rest_cells)
     gaps = None if even else gaps
     whole = extents_of_parts([points], smooth.disc, gaps)[0][0]
     return figures, textures | {"Sq": _rms_to_rim(points, gaps), "Sz": whole}

@@ -126,12 +126,9 @@ def spiral_offsets(found: Compensation, feed: float, per_turn: int) -> ToolPath:
     places = rim / feed * per_turn
     if places > _MOST_LINES:
         raise ConfigurationError(
-            "form.spiral_too_long",
-            feed=feed,
-            per_turn=per_turn,
-            lines=round(places),
+            "form.spiral_too_long", feed=feed, per_turn=per_turn, lines=round(places),
             most=_MOST_LINES,
-        )
+        )  # fmt: skip
     turned = np.arange(int(places) + 1) / per_turn
     radius, angle = rim - feed * turned, 2 * np.pi * turned
     offset = found.between(radius * np.cos(angle), -radius * np.sin(angle))

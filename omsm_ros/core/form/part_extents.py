@@ -128,14 +128,15 @@ class _PartForm(NamedTuple):
         even = map_.equal_areas(_MOST_DRAWN)
         order = self.local[np.argsort(form[self.local])]
         some = np.concatenate([even, order[:_HALF], order[-_HALF:]])
-        rim, (beyond, alone) = np.empty((2, 0)), np.zeros((2, 2))
+        (rim, outer), (beyond, alone) = (np.empty((2, 0)), np.empty(0)), np.zeros((2, 2))
         if gaps is not None:
             rest = self.above + shift
             rim = gaps.at_rim(form, rest, self.smooth, self.local, self.error)
+            outer = rim[0] + np.sum(gaps.outwards * form[gaps.near], axis=1)
             beyond, alone = gaps.beyond(form, self.above, rim[0], self.unseen, self.error)
         rows = self._drawn_to_rim(map_, form, some, gaps, rim)
-        of_rim = [np.max(way * rim[0], initial=np.max(way * form)) - np.max(way * form)
-                  for way in (-1, 1)]  # fmt: skip
+        tops = [[np.max(w * v, initial=-np.inf) for v in (form, rim[0], outer)] for w in (-1, 1)]
+        of_rim = np.ravel(np.diff(np.maximum.accumulate(tops, axis=1)) * (0.5, 1.0))
         of_waves = [np.max(way * form + self.texture) - np.max(way * form) for way in (-1, 1)]
         found = []
         many, form = form[map_.equal_areas(_MOST_FITTED)], np.append(form, rim[0])
@@ -157,7 +158,7 @@ class _PartForm(NamedTuple):
             figure = of_square(square, of_all)
             between = np.append(np.maximum(beyond, of_waves), -alone) / 2 * (all_ is form)
             value = (figure.value or 0.0) + _extents(all_, ends) - of_some + float(np.sum(between))
-            of_gaps = length(*between, *np.divide(of_rim, 2) * (all_ is form))
+            of_gaps = length(*between, *of_rim * (all_ is form))
             found.append(UncertainValue(float(value), length(figure.uncertainty or 0.0, of_gaps)))
         return found[0], found[1] if robust else UncertainValue(None, None)
 

@@ -11,7 +11,7 @@ from the last track to the rim the form goes on.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import comb
 from typing import NamedTuple
@@ -31,6 +31,7 @@ from omsm_ros.core.form.zernike_fit import (
 )
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
+from omsm_ros.core.surface.area_weights import errors_at_gaps
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 
 # The best Σ c_ij x^i y^j, i + j ≤ 2; what is no irregularity (ISO 10110-5), and its rest without
@@ -107,17 +108,16 @@ def _variance_by_tracks(map_: DeviationMap, share: FloatArray) -> float:
 
     The mean squares of successive passes of the path vary smoothly where the tracks resolve the
     form; their fourth differences show what they do not (systematic samples: K. Wolter,
-    Introduction to Variance Estimation, 2007, ch. 8).
+    Introduction to Variance Estimation, 2007, ch. 8). Area that one pass has too much the next one
+    lacks, so that it counts with the difference of both.
     """
     begins = passes(map_.x, map_.y)
     if begins is None:
         return 0.0
-    weight = np.maximum(np.add.reduceat(share, begins), np.finfo(np.float64).tiny)
-    means = np.add.reduceat(share * map_.deviation**2, begins) / weight
-    # The first and the last pass stand for less, at the rim, and may be incomplete.
-    about = (means - np.sum(weight * means))[1:-1]
-    of_areas = about**2 * _rough_squares(weight[1:-1])
-    return float(np.sum(weight**2 * _rough_squares(means)) + np.sum(of_areas))
+    means = np.add.reduceat(map_.deviation**2, begins) / np.diff(begins, append=len(map_))
+    weight = np.add.reduceat(share, begins)
+    of_areas = np.gradient(means) ** 2 * _rough_squares(weight) / 2
+    return float(np.sum(weight**2 * _rough_squares(means) + of_areas))
 
 
 def _rough_squares(values: FloatArray) -> FloatArray:
@@ -250,6 +250,10 @@ class Gaps(NamedTuple):
         fewer points differ (2, q, k)
     strip: along the rim, for the mean square of the form; None for an annulus
     share: of the area that half a track along the rim has
+    areas: share of the area that each point has (n,)
+    at_gaps: errors of means over the area, None without wide gaps
+    of_rim: error of the area at each place of a guessed rim, as a share of all (4, q)
+    outwards: weights of the change of the form half a track beyond a guessed rim (q, k)
     """
 
     x: FloatArray
@@ -260,14 +264,20 @@ class Gaps(NamedTuple):
     weights: FloatArray
     strip: RimStrip | None
     share: float
+    areas: FloatArray
+    at_gaps: Callable[[FloatArray], FloatArray] | None
+    of_rim: FloatArray
+    outwards: FloatArray
 
     @classmethod
     def of(
-        cls, map_: DeviationMap, outline: Aperture, spacing: float, strip: RimStrip | None = None
-    ) -> Gaps | None:
+        cls, map_: DeviationMap, outline: Aperture, spacing: float, strip: RimStrip | None = None,
+        *, guessed: bool = False, uncovered: float = 0.0,
+    ) -> Gaps | None:  # fmt: skip
         """Return the gaps between the points and to the ``outline``; None for a profile.
 
         strip: along the rim, for sums of piston and other terms, weighted by area
+        guessed: the outline is around the points;  uncovered: share of it in wide gaps
         """
         from scipy.spatial import cKDTree  # takes long to load
 
@@ -300,19 +310,31 @@ class Gaps(NamedTuple):
         weights[1, :, : _AROUND // 2] -= continued(apart.T[:, : _AROUND // 2] / spacing)[0]
         if strip is not None:
             strip = RimStrip(strip.points, *(v[:1] / map_.area.sum() for v in strip[1:]))
-        share = float(way[-1]) * spacing / abs(float(np.sum(u[:-1] * v[1:] - u[1:] * v[:-1])))
-        return cls(map_.x, map_.y, local, rim, near, weights, strip, share)
+        at_gaps = errors_at_gaps(map_.x, map_.y, outline, spacing) if uncovered else None
+        half = spacing / abs(float(np.sum(u[:-1] * v[1:] - u[1:] * v[:-1])))
+        # A guessed rim is off by up to half a track. It may lie elsewhere, or be larger.
+        of_rim = np.stack([du, dv, np.abs(du), np.abs(dv)])[:, close] * half / np.sqrt(3) * guessed
+        ahead = guessed / 2 * ((dv - 1j * du) / np.hypot(du, dv))[close, np.newaxis]
+        outwards = continued(apart.T / spacing - ahead)[0] - parabola
+        return cls(
+            map_.x, map_.y, local, rim, near, weights, strip, share=float(way[-1]) * half,
+            areas=map_.area / map_.area.sum(), at_gaps=at_gaps, of_rim=of_rim, outwards=outwards,
+        )  # fmt: skip
 
     def square(self, values: FloatArray) -> tuple[float, float]:
         """Return what form beyond the last track adds to the mean square of ``values`` (n,) [m].
 
         Second is the standard uncertainty of that [m²].
         """
+        rim, mean = np.sum(self.weights[0] * values[self.near], axis=1), self.areas @ values**2
+        open_ = [*(self.of_rim @ (rim**2 - mean))]
+        if self.at_gaps is not None:
+            open_ += [*self.at_gaps(values**2 - mean)]
         if self.strip is not None:
             more, errors = self.strip.missed(values[self.strip.points] ** 2)
-            return float(more[0]), float(np.linalg.norm(errors))
-        rim, last = np.sum(self.weights[0] * values[self.near], axis=1), values[self.near[:, 0]]
-        return 0.0, self.share * abs(float(np.mean(rim**2 - last**2))) / 2 if len(rim) else 0.0
+            return float(more[0]), length(*open_, float(np.linalg.norm(errors)))
+        rise = float(np.mean(rim**2 - values[self.near[:, 0]] ** 2)) if len(rim) else 0.0
+        return 0.0, length(*open_, self.share * rise / 2)
 
     def at_rim(self, form: FloatArray, rest: FloatArray, smooth: ZernikeFit, local: IntArray,
                noise: FloatArray) -> FloatArray:  # fmt: skip

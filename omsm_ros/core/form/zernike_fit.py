@@ -53,9 +53,11 @@ def passes(x: FloatArray, y: FloatArray) -> IntArray | None:
     crossed = max(_crossings(x), _crossings(y), key=len)
     if len(crossed) < 2:
         return None
-    # The passes begin with the first point, so that only the last is incomplete.
-    begins = np.append(crossed, 2 * crossed[-1] - crossed[-2]) - crossed[0]
-    begins = begins[begins < len(x)]
+    # Passes about a gap may not cross it. They begin with the first point, so that only the last is
+    # incomplete.
+    first, last = crossed[1] - crossed[0], crossed[-1] - crossed[-2]
+    more = np.arange(crossed[0] % first, crossed[0], first), np.arange(crossed[-1], len(x), last)
+    begins = np.concatenate([more[0], crossed[:-1], more[1]]) - crossed[0] % first
     enough = len(begins) >= _LEAST_PASSES and len(x) >= _LEAST_POINTS * len(begins)
     return begins if enough else None
 

@@ -81,11 +81,13 @@ class FormBasis:
 
     disc: of the Zernike terms, one at the rim;  mix: of all up to order 8 (k, 45)
     group: order of each, or the group of rings (k,)
+    level: weights of all that make piston and tilts, orthonormal over the area (l, 45)
     """
 
     disc: Aperture
     mix: FloatArray
     group: IntArray
+    level: FloatArray
 
     @classmethod
     def over(cls, x: FloatArray, y: FloatArray, area: FloatArray, disc: Aperture) -> FormBasis:
@@ -108,8 +110,9 @@ class FormBasis:
         form = _GROUPS[kept] >= 2
         if not np.any(form):
             raise DataError("registration.no_form")
-        mix = np.array(rows) * _USUAL[kept, np.newaxis] * _SCALE
-        return cls(disc, mix[form], _GROUPS[kept][form])
+        whole = np.array(rows) * _SCALE
+        mix = whole[form] * _USUAL[kept, np.newaxis][form]
+        return cls(disc, mix, _GROUPS[kept][form], whole[~form])
 
     def __len__(self) -> int:
         return len(self.group)

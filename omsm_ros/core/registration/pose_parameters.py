@@ -151,11 +151,9 @@ def weakest_dof(
     k = min(found)[1]
     angle = dofs.fitted[k] == "clocking"
     return dofs.fitted[k], Notice(
-        "registration.held_angle" if angle else "registration.held_length",
-        uncertainty=spread[k],
-        form=own[k] * spread[k],
-        value=values[k],
-    )
+        "registration.held_angle" if angle else "registration.held_length", uncertainty=spread[k],
+        form=own[k] * spread[k], value=values[k],
+    )  # fmt: skip
 
 
 def shape_asked(asked: Sequence[str]) -> tuple[str, ...]:

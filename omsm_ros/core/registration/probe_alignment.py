@@ -60,13 +60,9 @@ class SphereScan:
         """Return the samples behind points that were corrected without geometry and latency."""
         along, away = points.distance * np.cos(points.b), points.distance * np.sin(points.b)
         return cls(
-            x=points.slide_x - away,
-            y=points.slide_y,
-            z=points.height - along,
-            b=points.b,
-            c=points.c,
-            distance=points.distance,
-        )
+            x=points.slide_x - away, y=points.slide_y, z=points.height - along, b=points.b,
+            c=points.c, distance=points.distance,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -109,11 +105,9 @@ def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None =
     )
     known = _checked_radius(free, radius)
     found = _fitted(
-        radius,
-        lambda u: _misfit(scan, radius, start, u),
-        lambda u: _jacobian(scan, start, u),
+        radius, lambda u: _misfit(scan, radius, start, u), lambda u: _jacobian(scan, start, u),
         first,
-    )
+    )  # fmt: skip
     residual = _rms(found)
     deviations = _standard_uncertainties(found.jac, found.fun)
     if not known:
@@ -126,12 +120,9 @@ def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None =
     return Alignment(
         geometry=aligned,
         uncertainty=(float(in_si[0]), float(in_si[1]), float(lean[0]), float(lean[1])),
-        sphere=(sphere[0], sphere[1], sphere[2], radius),
-        residual=residual,
-        scatter=noise_of(found.fun) * MICROMETRE_M,
-        beam_found=beam,
-        used=len(scan.z),
-    )
+        sphere=(sphere[0], sphere[1], sphere[2], radius), residual=residual,
+        scatter=noise_of(found.fun) * MICROMETRE_M, beam_found=beam, used=len(scan.z),
+    )  # fmt: skip
 
 
 def _fitted(

@@ -16,20 +16,11 @@ from typing import NamedTuple
 import numpy as np
 
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.registration.form_model import (
-    LEAST_LIMIT_M,
-    NOT_SETTLED,
-    OUTLIER_SIGMAS,
-    Estimate,
-    FormBasis,
-    FormNormalEquations,
-    best_matching_sum,
-    estimate,
-    outlier_limit,
-)
+from omsm_ros.core.registration import form_model
 from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule, FarPoints
 from omsm_ros.core.registration.placement import (
     POSE_PARAMETERS,
+    Placed,
     Placement,
     PointBatch,
     PointBatches,
@@ -56,7 +47,7 @@ from omsm_ros.core.registration.pose_parameters import (
 from omsm_ros.core.streams import statistics
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.aperture import Aperture, disc_of, within_aperture
-from omsm_ros.core.surface.area_weights import area_weights, covered_places
+from omsm_ros.core.surface.area_weights import area_weights, covered_places, errors_at_gaps
 from omsm_ros.core.surface.posed import PosedSurface
 from omsm_ros.core.surface.shape_parameters import start_of
 from omsm_ros.errors import DataError
@@ -78,7 +69,7 @@ def coarse_placement(
         if turn and len(points.x):
             middle = points.deviation - np.median(points.deviation)
             # The limit is wide, because the pose still contributes to the spread.
-            limit = max(8 * statistics.spread(middle), LEAST_LIMIT_M)
+            limit = max(8 * statistics.spread(middle), form_model.LEAST_LIMIT_M)
             points = points.part(np.abs(middle) <= limit)
         if len(points.x) < least_points(points):
             break
@@ -86,11 +77,9 @@ def coarse_placement(
         scale = np.sqrt(np.mean(columns**2, axis=1))
         columns /= scale[:, np.newaxis]
         step = _bounded_step(
-            columns,
-            points.deviation,
-            np.array([at.value(n) for n in names]) * scale,
+            columns, points.deviation, np.array([at.value(n) for n in names]) * scale,
             [typical_range(n) for n in names] * scale,
-        )
+        )  # fmt: skip
         step /= max(turn - _WHOLE_STEPS, 1)
         at = at.moved(names, step / scale)
         settled = max(SHARE_OF_SPREAD * statistics.spread(points.deviation), _SETTLED_M)
@@ -163,8 +152,8 @@ def register(
     points = inside_aperture(placed(surface, at, chosen), aperture)
     disc = aperture.disc if aperture else disc_of(points.x, points.y)
     x, y, area = _measured_area(points.x, points.y, aperture or disc, even)
-    basis = FormBasis.over(x, y, area, disc)
-    fit = _PoseFit(surface, dofs, aperture, basis, at)
+    basis = form_model.FormBasis.over(x, y, area, disc)
+    fit = _PoseFit(surface, dofs, aperture, basis, at, even)
     stand = fit.refine(at, chosen)
     open_ = OpenUncertainty(fit.unknown(stand.at, chosen))
     if AUTO in asked:
@@ -223,14 +212,16 @@ class _PlacementState(NamedTuple):
     """Converged fit of the selected points.
 
     at: placement;  like: coefficients of the free fit there (q,);  limit: of outliers [m]
-    found, sums: estimate and its normal equations
+    found, sums: estimate and its normal equations;  points, columns: of these (n,), (q, n)
     """
 
     at: Placement
     like: FloatArray
     limit: float
-    found: Estimate
-    sums: FormNormalEquations
+    found: form_model.Estimate
+    sums: form_model.FormNormalEquations
+    points: Placed
+    columns: FloatArray
 
 
 def _useful(
@@ -255,7 +246,7 @@ def _useful(
             break
         # A nominal value that the points contradict takes what is asked for far away.
         away = np.abs([fixed.at.value(n) for n in fitted] - values)
-        beyond = away > OUTLIER_SIGMAS * np.sqrt(np.diag(covariance))
+        beyond = away > form_model.OUTLIER_SIGMAS * np.sqrt(np.diag(covariance))
         if np.any(beyond & np.isin(fitted, asked)):
             break
         fit, stand = less, fixed
@@ -271,13 +262,14 @@ def _useful(
 
 @dataclass(frozen=True, eq=False)
 class _PoseFit:
-    """Fixed inputs of the passes;  plain: the least-squares placement."""
+    """Fixed inputs of the passes;  plain: the least-squares placement;  even: points of a grid."""
 
     surface: Surface
     dofs: PoseParameters
     aperture: Aperture | None
-    basis: FormBasis
+    basis: form_model.FormBasis
     plain: Placement
+    even: bool
 
     def unknown(self, at: Placement, chosen: PointBatch) -> dict[str, dict[str, FloatArray]]:
         """Return the effect (2,) of each undetermined pose parameter on each fitted one.
@@ -305,7 +297,7 @@ class _PoseFit:
 
     def sums(
         self, stand: _PlacementState, portion: PointBatch, held_effects: FloatArray,
-        sums: FormNormalEquations, far: FarPoints | None = None,
+        sums: form_model.FormNormalEquations, far: FarPoints | None = None,
     ) -> PointBatch:  # fmt: skip
         """Add the points of a ``portion`` to ``sums``, with residuals from the free fit.
 
@@ -335,7 +327,9 @@ class _PoseFit:
             begin += len(good)
         return PointBatch(*(v[..., beyond] for v in portion))
 
-    def solved(self, at: Placement, sums: FormNormalEquations) -> tuple[Estimate, float]:
+    def solved(
+        self, at: Placement, sums: form_model.FormNormalEquations
+    ) -> tuple[form_model.Estimate, float]:
         """Return the estimate, and the variance of one point's noise [m²]."""
         free = len(self.dofs.fitted)
         variance = sums.square / max(sums.points - sums.columns, 1)
@@ -350,8 +344,26 @@ class _PoseFit:
         left = sums.total - float(right @ np.linalg.lstsq(pose, right, rcond=1e-12)[0])
         largest = max(left, sums.square) / max(sums.points, 1)
         noise, expected = variance * max(together, 1.0), self.expected(at)
-        found = estimate(square, moments, noise, largest, self.basis.group, expected)
+        found = form_model.estimate(square, moments, noise, largest, self.basis.group, expected)
         return found, variance
+
+    def at_gaps(
+        self, stand: _PlacementState, found: form_model.Estimate, count: int, track: float
+    ) -> FloatArray:
+        """Return steps of the pose (p, g) by which the ends of the measured area are uncertain.
+
+        Form has no piston and tilts over it.  found: from ``count`` points;  track: distance [m]
+        """
+        if self.even:
+            return np.empty((len(found.step), 0))
+        points, disc = stand.points, self.basis.disc
+        # A guessed outline ends at the points.
+        outline = self.aperture or replace(disc, radius=disc.radius + 2 * track)
+        at_gaps = errors_at_gaps(points.x, points.y, outline, track)
+        level = self.basis.level @ self.basis.terms(points.x, points.y)
+        form = points.deviation - stand.found.step @ stand.columns[: len(found.step)]
+        moments = stand.columns @ level.T @ at_gaps(level * form).T * count / len(form)
+        return np.asarray(found.covariance[: len(found.step)] / found.noise @ moments)
 
     def expected(self, at: Placement) -> tuple[FloatArray, FloatArray]:
         """Return the values of the pose and the standard deviations of their priors, both (p,).
@@ -369,24 +381,24 @@ class _PoseFit:
             points = inside_aperture(placed(self.surface, at, chosen), self.aperture)
             z = self.basis.columns(points.x, points.y)
             columns = np.concatenate([-dof_columns(at, points, self.dofs.fitted), z])
-            like, residual, near, gram = best_matching_sum(columns, points.deviation)
-            sums = FormNormalEquations(len(self.dofs.fitted) + len(self.basis), 0)
+            like, residual, near, gram = form_model.best_matching_sum(columns, points.deviation)
+            sums = form_model.FormNormalEquations(len(self.dofs.fitted) + len(self.basis), 0)
             sums.add(columns, points.deviation, np.empty((0, len(near))), residual, near, gram)
             found, _ = self.solved(at, sums)
-            settled = max(SHARE_OF_SPREAD * statistics.spread(residual), LEAST_LIMIT_M)
+            settled = max(SHARE_OF_SPREAD * statistics.spread(residual), form_model.LEAST_LIMIT_M)
             # The joint effect counts: a tilt may cancel a shift.
             gram = sums.gram[: len(found.step), : len(found.step)]
             square = float(found.step @ gram @ found.step) / sums.points
             still = square < settled**2 or found.length < _SHARE_OF_UNCERTAINTY
             if turn > 1 and still:
                 smooth = np.concatenate([found.step, found.form]) @ columns
-                limit = outlier_limit(points.deviation - smooth)
-                return _PlacementState(at, like, limit, found, sums)
+                limit = form_model.outlier_limit(points.deviation - smooth)
+                return _PlacementState(at, like, limit, found, sums, points, columns)
             # A longer step than the deviation corrects none of it: form would have to cancel it.
             longest = sums.total / sums.points / max(square, float(np.finfo(np.float64).tiny))
             share = min(1.0, float(np.sqrt(longest)))
             at = at.moved(self.dofs.fitted, share * found.step)
-        raise DataError(NOT_SETTLED)
+        raise DataError(form_model.NOT_SETTLED)
 
 
 def _over_all(
@@ -395,7 +407,7 @@ def _over_all(
 ) -> Registration:  # fmt: skip
     """Return the registration from one pass over all points, in which dust comes last."""
     free, held = len(fit.dofs.fitted), root_of(open_.held)
-    sums = FormNormalEquations(free + len(fit.basis), len(sources) + 2 * len(held))
+    sums = form_model.FormNormalEquations(free + len(fit.basis), len(sources) + 2 * len(held))
     square, points, far, beyond = 0.0, 0.0, FarPoints(stand.limit), []
     for portion in portions():
         beyond.append(fit.sums(stand, portion, held, sums, far))
@@ -410,7 +422,9 @@ def _over_all(
     found, variance = fit.solved(stand.at, sums)
     # Each column is the step of the pose for one standard uncertainty of a source.
     moved = found.covariance[:free] / found.noise @ sums.gram[:, sums.columns + 1 :]
-    covariance, names = found.covariance[:free, :free], (*sources, *[HELD] * 2 * len(held))
+    spacing, names = far.space().spacing, (*sources, *[HELD] * 2 * len(held))
+    at_gaps = fit.at_gaps(stand, found, sums.points, spacing)
+    covariance = found.covariance[:free, :free] + at_gaps @ at_gaps.T
     by_source = open_.by_source(fit.dofs.fitted, covariance, names, moved)
     at = stand.at.moved(fit.dofs.fitted, found.step)
     return Registration(
@@ -418,6 +432,6 @@ def _over_all(
         pose_effects=root_of(covariance), taken=shares_of(root_of(covariance), found.likely),
         held_effects=held, moved=moved, spread=open_.spread(fit.dofs, by_source),
         correlated_moves=open_.unknown, limit=stand.limit, dust=left_out,
-        spacing=far.space().spacing, disc=disc, basis=fit.basis, form=found.form,
+        spacing=spacing, disc=disc, basis=fit.basis, form=found.form,
         noise=float(np.sqrt(variance)), before=float(np.sqrt(square / max(points, 1.0))),
     )  # fmt: skip

@@ -10,6 +10,8 @@ It depends on the path of the scan.
   other point.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,6 +39,8 @@ _MOST_CELLS, _FILLED, _OF_RIM, _FINELY_FILLED = 768, 3.5, 2.5, 3.8
 _FINER = 4
 # Longest step along a track, in usual steps and distances of points; nearest points of a place.
 _LONGEST, _AROUND = 4.0, 6
+# Points next to which gaps are looked for; they have no point within this share of the next track.
+_MOST_AT_GAPS, _MISSED = 20_000, 0.7
 # Largest width of a single line relative to its length.
 LINE_WIDTH = 1e-6
 
@@ -208,18 +212,64 @@ def _stand_for(
     """Return for which ``places`` (k,) [m] the ``points`` (n,) of a path over an ``area`` stand."""
     from scipy.spatial import cKDTree  # takes long to load
 
-    steps, sizes = np.diff(points), np.abs(np.diff(points))
-    # A jump to another track is no part of the path.
-    longest = _LONGEST * max(float(np.median(sizes)), np.sqrt(area / len(points)))
-    track = area / np.sum(sizes, where=sizes < longest)
+    step, jumps = _steps(points, float(np.sqrt(area / len(points))))
+    sizes = np.abs(np.diff(points))
+    track = area / (np.sum(sizes) - np.sum(sizes[jumps]))
     rows = (v.view(np.float64).reshape(-1, 2) for v in (points, places))
     _, near = cKDTree(next(rows)).query(next(rows), _AROUND)
-    before, after = np.append(steps[:1], steps), np.append(steps, steps[-1:])
-    step = np.where(np.abs(before) < np.abs(after), before, after)[near]
+    step = step[near]
     # Along the track and across it, times the step.
     apart, size = (places[:, np.newaxis] - points[near]) * step.conj(), np.abs(step)
     within = (np.abs(apart.real) <= size**2 / 2) & (np.abs(apart.imag) <= size * track / 2)
     return np.asarray(np.any(within, axis=1))
+
+
+def errors_at_gaps(
+    x: FloatArray, y: FloatArray, outline: Aperture, track: float
+) -> Callable[[FloatArray], FloatArray]:
+    """Return the standard uncertainties (g, …) of means over the area of a path's points (…, n).
+
+    A gap may begin anywhere up to the next point that is missing. The ends of tracks are off alike,
+    because samples may be in step with turns or lines, as are points in a row along a gap.
+
+    track: distance of neighbouring tracks [m]
+    """
+    from scipy.sparse import csr_array  # these take long to load
+    from scipy.spatial import cKDTree
+
+    points, every = x + 1j * y, max(len(x) // _MOST_AT_GAPS, 1)
+    track = max(track, float(np.sqrt(np.ptp(x) * np.ptp(y) / len(x))))  # of every k-th point
+    (step, _), steps = _steps(points, track), np.diff(points)
+    tree, few, size = cKDTree(np.column_stack([x, y])), np.arange(0, len(x), every), np.abs(step)
+    # A path ends at a gap where it jumps over it, or turns.
+    last, first = (1 + np.flatnonzero(np.abs(np.diff(steps)) > np.abs(s))
+                   for s in (steps[:-1], steps[1:]))  # fmt: skip
+    ends, across = (len(x), 1), (2 * every, every)
+    ways = [(last, steps[last - 1], ends), (first, -steps[first], ends)]
+    ways += [(few, side * step[few], across) for side in (1j, -1j)]
+    found = []
+    for own, way, (in_a_row, each) in ways:
+        there = points[own] + track * way / np.maximum(np.abs(way), np.finfo(np.float64).tiny)
+        away, _ = tree.query(np.column_stack([there.real, there.imag]))
+        own = own[outline.holds(there.real, there.imag) & (away > _MISSED * track)]
+        found.append((np.append(True, np.diff(own) > in_a_row)[: len(own)], own, each * size[own]))
+    new, own, errors = (np.concatenate(v) for v in zip(*found, strict=True))
+    begins = np.append(np.flatnonzero(new), len(own))
+    rows = errors / np.sum(size) / np.sqrt(12), own, begins
+    areas = csr_array(rows, (len(begins) - 1, len(x)))
+    return lambda values: np.asarray(areas @ values.T)
+
+
+def _steps(points: NDArray[np.complex128], apart: float) -> tuple[NDArray[np.complex128], IntArray]:
+    """Return the step of a path at each of its ``points`` (n,) [m], and the last before each jump.
+
+    apart: distance of the points [m]
+    """
+    steps = np.diff(points)
+    before, after, sizes = np.append(steps[:1], steps), np.append(steps, steps[-1:]), np.abs(steps)
+    # A jump to another track is no part of the path.
+    jumps = np.flatnonzero(sizes >= _LONGEST * max(float(np.median(sizes)), apart))
+    return np.where(np.abs(before) < np.abs(after), before, after), jumps
 
 
 def _tiles(x: FloatArray, y: FloatArray, side: int) -> tuple[IntArray, tuple[int, int]]:

@@ -68,14 +68,11 @@ def measured(
     known = np.isfinite(height) & ~np.isnan(x) & ~np.isnan(y)
     order = None if sample is None else COUNTER.checked_all(sample[known], DataError, "sample")
     return MeasuredPoints(
-        x=x[known],
-        y=y[known],
-        height=height[known],
+        x=x[known], y=y[known], height=height[known],
         uncertainty=None if uncertainty is None else np.asarray(uncertainty[known], np.float64),
-        sample=None if order is None else order.astype(np.int64),
-        missing=int(np.sum(~known)),
+        sample=None if order is None else order.astype(np.int64), missing=int(np.sum(~known)),
         notes=notes,
-    )
+    )  # fmt: skip
 
 
 def without_duplicates(points: MeasuredPoints) -> MeasuredPoints:

@@ -59,10 +59,8 @@ def ansi(j: int) -> ZernikeIndex:
 
 
 NUMBERING: dict[str, tuple[Callable[[int], ZernikeIndex], int]] = {
-    "noll": (noll, 1),
-    "fringe": (fringe, 1),
-    "ansi": (ansi, 0),
-}
+    "noll": (noll, 1), "fringe": (fringe, 1), "ansi": (ansi, 0),
+}  # fmt: skip
 """Each numbering with its first number."""
 
 

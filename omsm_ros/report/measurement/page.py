@@ -330,10 +330,8 @@ def _records(report: Report) -> list[tables.Table]:
     summary = report.summary
     found = [
         form_table(report.form, report.curves, part(summary, "figures")),
-        tables.budget_table(summary),
-        limits_table(summary),
-        tables.sample_table(summary),
-    ]
+        tables.budget_table(summary), limits_table(summary), tables.sample_table(summary),
+    ]  # fmt: skip
     if report.calibration is not None:
         found.append(tables.calibration_table(report.calibration))
     found.append(tables.mapping_table("Settings", part(summary, "settings") or {}))
