@@ -1,5 +1,7 @@
 """A table that a shop changed is read as what it is, or refused; never as something else."""
 
+import contextlib
+import io
 import json
 
 import numpy as np
@@ -24,6 +26,17 @@ def calibration(tmp_path_factory, true_calibration):
     return path
 
 
+@pytest.fixture(scope="module")
+def as_written(tmp_path_factory, calibration):
+    """Return status and facts of a prediction of the motion before a shop changed its table."""
+    folder = tmp_path_factory.mktemp("written")
+    (folder / "t.csv").write_bytes(shop.written(ROWS))
+    words = ["predict", str(folder / "t.csv"), "--calibration", str(calibration), "--json"]
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        status = cli.main(words)
+    return status, json.loads(said.getvalue())
+
+
 def predicted(folder, text, calibration, capsys):
     (folder / "t.csv").write_bytes(text)
     words = ["predict", str(folder / "t.csv"), "--calibration", str(calibration), "--json"]
@@ -41,19 +54,17 @@ def exported(folder, text, capsys):
 
 
 @pytest.mark.parametrize("way", shop.HARMLESS)
-def test_what_is_harmless_changes_no_answer(way, tmp_path, calibration, capsys):
-    right = predicted(tmp_path, shop.written(ROWS), calibration, capsys)
-    assert predicted(tmp_path, shop.HARMLESS[way](ROWS), calibration, capsys) == right
+def test_what_is_harmless_changes_no_answer(way, tmp_path, calibration, as_written, capsys):
+    assert predicted(tmp_path, shop.HARMLESS[way](ROWS), calibration, capsys) == as_written
     truth = np.array(POINTS[1:], float)
     status, found = exported(tmp_path, shop.HARMLESS[way](POINTS), capsys)
     assert status == 0, found
     assert found == pytest.approx(truth, rel=1e-8)
 
 
-def test_a_motion_and_points_in_utf_16_are_read(tmp_path, calibration, capsys):
+def test_a_motion_and_points_in_utf_16_are_read(tmp_path, calibration, as_written, capsys):
     motion, points = (shop.written(rows).decode().encode("utf-16") for rows in (ROWS, POINTS))
-    right = predicted(tmp_path, shop.written(ROWS), calibration, capsys)
-    assert predicted(tmp_path, motion, calibration, capsys) == right
+    assert predicted(tmp_path, motion, calibration, capsys) == as_written
     status, found = exported(tmp_path, points, capsys)
     assert status == 0
     assert found == pytest.approx(np.array(POINTS[1:], float), rel=1e-8)

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from soaked import soaked
 
 from omsm_ros.instruments.arrivals import MissedTriggerDetector
 
@@ -16,7 +17,7 @@ PERIOD = 1e-3
 UPTIME_S = 123_456.0  # of the host, from which its monotonic clock counts
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", [0, 1, *soaked(*range(2, 8))])
 @pytest.mark.parametrize("missed", [0, 1])
 def test_polls_in_step_with_the_trigger_are_never_renumbered(seed: int, missed: int) -> None:
     """The age of their last sample falls by a period now and then, as if a trigger was missed."""

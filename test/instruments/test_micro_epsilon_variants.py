@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from soaked import always
+from soaked import always, soaked
 
 from omsm_ros.errors import DeviceError
 from omsm_ros.instruments.emulator import AXIS_SCALING
@@ -96,7 +96,7 @@ def turned(wire: bytes) -> bytes:
     return wire[:28] + frames.tobytes()
 
 
-@pytest.mark.parametrize("rate", [0.5, 0.85, 2.0])
+@pytest.mark.parametrize("rate", [0.85, 2.0, *soaked(0.5)])
 def test_a_grossly_wrong_rate_shows_within_some_two_seconds(bench: Any, rate: float) -> None:
     """By its arrivals, for the device tells no time."""
     run = bench(ConfocalDtEmulator, ConfocalDtEthernetDevice, THREE)
@@ -112,8 +112,10 @@ BAUD = np.array([0, 0xF8, 0xFE, 0x80, 0xE0, 0x1E, 0x66, 0x9E, 0xFF], np.uint8)
 
 
 @pytest.mark.parametrize("trigger", always("each", of=["free_run", "each"]))
-@pytest.mark.parametrize("values", [("distance",), ("distance", "counter")])
-@pytest.mark.parametrize("noise", [np.arange(256, dtype=np.uint8), BAUD])
+@pytest.mark.parametrize(
+    ("values", "noise"),
+    [(("distance",), BAUD), (("distance", "counter"), np.arange(256, dtype=np.uint8))],
+)
 def test_noise_is_no_sample(bench: Any, noise: Any, values: Any, trigger: str) -> None:
     class Noise(ConfocalDtSerialEmulator):
         def pack(self, measured: Any, counters: Any, times_ns: Any) -> list[bytes]:

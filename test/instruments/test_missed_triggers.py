@@ -284,8 +284,8 @@ def test_a_busy_host_tells_later_how_many_were_missed(quick: float, latest: floa
 def test_what_the_arrivals_cannot_show_is_stated_and_confirms_nothing() -> None:
     """Even the earliest of all arrivals of a second is late by more than two periods."""
     random, detector = np.random.default_rng(2), MissedTriggerDetector(PERIOD)
-    due = np.arange(1, 2000) * 0.01
-    for d, a in zip(due, np.maximum.accumulate(due + random.uniform(0, 0.1, 1999)), strict=True):
+    due = np.arange(1, 1000) * 0.01
+    for d, a in zip(due, np.maximum.accumulate(due + random.uniform(0, 0.1, 999)), strict=True):
         assert not detector.confirms(float(d), UPTIME_S + float(a))
     assert detector.least_missed > 3
 
@@ -366,8 +366,9 @@ def cut(
     return counts, triggers, cutter
 
 
-@pytest.mark.parametrize("level", [0.0, 0.01])
-@pytest.mark.parametrize("at", [0.6, 5.9])
+@pytest.mark.parametrize(
+    ("at", "level"), [(0.6, 0.01), (5.9, 0.0), *soaked((0.6, 0.0), (5.9, 0.01))]
+)
 def test_a_missed_trigger_is_detected_at_the_start_and_near_pauses_of_the_host(
     at: float, level: float
 ) -> None:
@@ -421,8 +422,10 @@ def test_an_arrival_in_time_after_a_reset_confirms_at_once(pause: float, within:
     assert any(later[:5]) == (pause == 0)
 
 
-@pytest.mark.parametrize("level", [0.0, 0.005])
-@pytest.mark.parametrize("after", [0.0, 0.002, 1.0])
+@pytest.mark.parametrize(
+    ("after", "level"),
+    [(0.0, 0.0), (0.002, 0.005), (1.0, 0.0), *soaked((0.0, 0.005), (0.002, 0.0), (1.0, 0.005))],
+)
 def test_a_trigger_missed_at_or_after_a_reset_is_seen(after: float, level: float) -> None:
     counts, triggers, cutter = cut(reset=5003, missed_at=5.003 + after, level=level)
     np.testing.assert_array_equal(counts, triggers)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from soaked import soaked
 
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.errors import ConfigurationError, DeviceError
@@ -54,13 +55,14 @@ def wait(done: object, reader: DeviceReader) -> None:
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize("where", ["pty", "tcp"])
-@pytest.mark.parametrize("name", EMULATED)
+LINES = [(name, "tcp" if emulated(name).tcp else "pty") for name in EMULATED]
+BY_TCP_TOO = [(name, "tcp") for name in EMULATED if not emulated(name).tcp]
+
+
+@pytest.mark.parametrize(("name", "where"), [*LINES, BY_TCP_TOO[0], *soaked(*BY_TCP_TOO[1:])])
 def test_the_twins_motion_comes_out(
     name: str, where: str, tmp_path: Path, step_test: Recording
 ) -> None:
-    if where == "pty" and emulated(name).tcp:
-        pytest.skip("speaks TCP only")
     link = str(tmp_path / "probe") if where == "pty" else "tcp://127.0.0.1:0"
     blocks = play(name, link, step_test)
     axes = [b.axes for b in blocks if b.axes is not None]

@@ -50,8 +50,7 @@ def test_samples_are_stamped_by_their_arrival_not_by_the_read() -> None:
     assert axes.stamp_ns == 10**18 - 250 * MS - 9 * MS
 
 
-@pytest.mark.parametrize("time_ns", [0, 10**18])
-@pytest.mark.parametrize("together", [1, 20])
+@pytest.mark.parametrize(("time_ns", "together"), [(0, 1), (10**18, 20)])
 def test_a_time_that_stands_still_is_an_error(time_ns: int, together: int) -> None:
     """A controller whose program does not fill the time in, not one spoilt on the line."""
     frames, now = frames_of(np.arange(2000)), 0.0
