@@ -180,16 +180,19 @@ def test_a_light_mode_takes_the_place_of_poles_that_imitated_it():
     assert np.all(off < 3 * np.hypot(band.gain, band.phase))
 
 
-def test_a_line_of_vibration_is_no_pole():
-    found = searched(20e-9 * np.sin(2 * np.pi * 13.7 * TIME + 1.0))
-    assert {modelled.term.family for modelled in found.nuisance_terms} == {VIBRATION}
+@pytest.mark.parametrize(
+    ("added", "family"),
+    [
+        (20e-9 * np.sin(2 * np.pi * 13.7 * TIME + 1.0), VIBRATION),
+        (200e-9 * np.sin(2 * np.pi * TIME / 20), DRIFT),
+    ],
+)
+def test_a_line_is_vibration_a_bend_is_drift_and_neither_is_a_pole(added, family):
+    found = searched(added)
+    assert {modelled.term.family for modelled in found.nuisance_terms} == {family}
     assert all(abs(pole) > 200 for pole in found.model.chosen.fit.dynamics.poles())
-
-
-def test_a_curved_drift_is_drift_and_no_pole():
-    found = searched(200e-9 * np.sin(2 * np.pi * TIME / 20))
-    assert {modelled.term.family for modelled in found.nuisance_terms} == {DRIFT}
-    assert all(abs(pole) > 200 for pole in found.model.chosen.fit.dynamics.poles())
+    assert found.p_value > FALSE_ALARM
+    assert found.model.chosen.fit.rms == pytest.approx(10e-9, rel=0.03)
 
 
 def played(width):

@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 from late_steps import LATE, NOISE, STEPS, TIME, late_record
-from soaked import soaked
 
 from omsm_ros.core.estimation.model_order import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.model_choice import model_from_start
 from omsm_ros.core.identification.model_error_search import search_model_errors
 from omsm_ros.core.lti.transfer_function import Structure
-from omsm_ros.core.model_errors.families import DRIFT, PERIODIC, VIBRATION
-from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM, ResidualDiagnostics
+from omsm_ros.core.model_errors.families import PERIODIC, VIBRATION
+from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
 
 
 def prepared_of(added):
@@ -51,13 +50,3 @@ def test_an_error_between_two_periods_of_the_travel_is_one_error(period):
     found = [b.term.parameter for b in searched.nuisance_terms if b.term.family == PERIODIC]
     assert len(found) == 1
     assert found[0] == pytest.approx(period, rel=0.01)
-
-
-@pytest.mark.parametrize(("periods", "family"), [(1.0, DRIFT), *soaked((3.1, VIBRATION))])
-def test_what_wanders_slowly_is_a_drift_and_what_repeats_is_a_line(periods, family):
-    """Lines begin at two periods over the record; either leaves nothing of it."""
-    wandering = 50e-9 * np.sin(2 * np.pi * periods * TIME / TIME[-1] + 0.3)
-    searched = search_model_errors(prepared_of(wandering), model_from_start)
-    assert family in {b.term.family for b in searched.nuisance_terms}
-    assert searched.p_value > FALSE_ALARM
-    assert searched.model.chosen.fit.rms == pytest.approx(NOISE, rel=0.03)
