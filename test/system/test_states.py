@@ -108,11 +108,11 @@ def test_two_cells_side_by_side(cell, true_calibration):
     """Each measures its own motion, and neither hears a sample of the other."""
     path = cell.folder / "cal.json"
     save_calibration(path, true_calibration)
-    cells = {"/omsm": 29_000, "/hall/cell2": 20_000}
-    for namespace in cells:
+    cells = {"/omsm": 10_000, "/hall/cell2": 8_000}
+    for namespace, samples in cells.items():
         link = str(cell.folder / namespace.strip("/").replace("/", "_"))
         given = {
-            "cell_emulator": {"link": link, "time_lapse": 20.0, "start_radius": 1e-3},
+            "cell_emulator": {"link": link, "time_lapse": 20.0, "start_radius": samples * 5e-8},
             "confocal_driver": {"port": link, **SCALES},
             "corrector": {"calibration": str(path)},
         }
@@ -131,8 +131,8 @@ def test_two_cells_side_by_side(cell, true_calibration):
                 and cell.operator.value(name(n, "confocal_driver"), "connections") == 1
             ),
         )
-    for namespace, motion in (("/omsm", "step_test"), ("/hall/cell2", "scan")):
-        service = f"{namespace}/cell_emulator/{motion}"
+    for namespace in cells:
+        service = f"{namespace}/cell_emulator/scan"
         assert cell.operator.ask(Trigger, service, Trigger.Request()).success
     for namespace, samples in cells.items():
         cell.wait(
