@@ -87,13 +87,10 @@ def measurement_at(
     if summary.is_file():
         calibration = str(read_result(summary, "summary").get("calibration", ""))
     measured = ComparedMeasurement(
-        name=str(path),
-        points=points,
-        fields=_fields_file_of(path, points),
-        common=options.uncertainty if points.uncertainty is None else None,
-        drift=options.drift,
+        name=str(path), points=points, fields=_fields_file_of(path, points),
+        common=options.uncertainty if points.uncertainty is None else None, drift=options.drift,
         calibration=calibration,
-    )
+    )  # fmt: skip
     if nominal is None or options.register is None:
         return measured
     return registered(measured, nominal, options.register)

@@ -296,10 +296,13 @@ class Gaps(NamedTuple):
         some = some if len(some) >= _AROUND else np.arange(len(map_))
         corners = outline.rim()
         (u, v), way = corners, np.cumsum(np.hypot(*np.diff(corners, prepend=corners[:, :1])))
-        at = np.linspace(0, way[-1], max(_PLACES, int(way[-1] / spacing)), endpoint=False)
+        # Equal parts of each side, because smooth form is often highest in a corner.
+        parts = np.ceil(np.diff(way) / way[-1] * max(_PLACES, way[-1] / spacing) - 1e-6)
+        at = np.interp(np.arange(parts.sum()), np.append(0, np.cumsum(parts)), way)
         rim = np.stack([np.interp(at, way, u), np.interp(at, way, v)])
         away, near = cKDTree(np.stack([map_.x, map_.y], axis=1)[some]).query(rim.T, _AROUND)
-        near, place, (du, dv) = some[near], rim[0] + 1j * rim[1], np.gradient(rim, axis=1)
+        near, place = some[near], rim[0] + 1j * rim[1]
+        du, dv = (np.roll(rim, -1, axis=1) - np.roll(rim, 1, axis=1)) / 2
         apart = map_.x[near].T + 1j * map_.y[near].T - place
         # Within a sector that was not measured all points lie on one side.
         sides = (apart * (du - 1j * dv)).real

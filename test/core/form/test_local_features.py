@@ -120,6 +120,23 @@ def test_an_edge_that_flattens_towards_the_rim_is_continued_to_it():
     assert abs(whole.value - true) < 2 * whole.uncertainty < 12e-9
 
 
+@pytest.mark.parametrize("corner", [(1, 1), (-1, 1), (-1, -1), (1, -1)])
+def test_form_that_is_highest_in_a_corner_reaches_it(corner):
+    """A spiral passes the corners of a rectangle within one of its turns."""
+    share, turns, size = np.linspace(1, 0, 16_000), 60, np.array([[R], [0.7 * R]])
+    turn = 2 * np.pi * turns * share + 0.3
+    x, y = 1.45 * size * share * np.array([np.cos(turn), np.sin(turn)])
+    outline = Aperture.of("rectangle", R, 0.7 * R)
+    places = np.stack([x, y])[:, outline.holds(x, y)]
+    form = 200e-9 * np.clip(corner @ (places / size) / 2, 0, None) ** 3
+    map_ = DeviationMap(x=places[0], y=places[1], deviation=form, noise=1e-12,
+                        area=area_weights(*places, outline=outline),
+                        effects=np.empty((0, len(form))))  # fmt: skip
+    gaps = gaps_of(map_, outline, 1.45 * 0.7 * R / turns)
+    whole = extents_of_parts([map_], outline.disc, gaps)[0][0]
+    assert abs(whole.value - 200e-9) <= 2 * whole.uncertainty < 10e-9
+
+
 @pytest.mark.parametrize("angle", [0.4, *soaked(2.0, 3.6)])
 def test_points_far_apart_along_steep_tracks_are_no_dust(angle):
     """Coma is steepest at the rim, where the points of a turn are two tracks apart."""
