@@ -21,10 +21,13 @@ from omsm_ros.twin.scenario import Scenario, scan_of
 def pytest_configure():
     """Make the tests independent of a busy computer and of a shell in the background.
 
-    Hypothesis limits an example to 200 ms, but each test has its own time-out. A background shell
-    ignores SIGINT, and so would every node that a test starts.
+    Hypothesis limits an example to 200 ms, but each test has its own time-out. Its examples are the
+    same in every run. A background shell ignores SIGINT, and so would every node that a test
+    starts.
     """
-    hypothesis.settings.register_profile("whole tests are timed", deadline=None, max_examples=30)
+    hypothesis.settings.register_profile(
+        "whole tests are timed", deadline=None, max_examples=30, derandomize=True
+    )
     hypothesis.settings.load_profile("whole tests are timed")
     pytest.approx = approx
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -110,8 +110,8 @@ def test_a_part_in_any_pose_has_the_figure_of_the_part(capsys, shop):
     one, other = (found[n]["peak_to_valley"] for n in ("scan", "posed"))
     spread = np.hypot(one["standard_uncertainty"], other["standard_uncertainty"])
     assert abs(one["value"] - other["value"]) < 3 * spread
-    # The pose adds little to the uncertainty that one scan leaves.
-    assert other["standard_uncertainty"] < 1.5 * one["standard_uncertainty"] < 1e-7
+    # The pose adds little to the uncertainty that one scan leaves, drift in it.
+    assert other["standard_uncertainty"] < min(1.5 * one["standard_uncertainty"], 1e-7)
 
 
 def test_a_step_test_is_no_scan(capsys, shop):
