@@ -130,7 +130,7 @@ class Residual(CheckedRecord):
 
     rms_m: of the residual;  noise_m: standard deviation of a reading where the axis rests
     chi_square: mean square residual where the axis moves over that of the noise
-    whiteness_p, independence_p: p-values of Ljung's tests
+    whiteness_p: of the test of Ljung;  independence_p: least of the tests against the motion
     response_agreement: mean square difference from the response estimated without a model, over
         its variance
     timing_scatter_s, axis_timing_scatter_s: standard deviation of the times of readings

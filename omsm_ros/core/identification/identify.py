@@ -285,7 +285,7 @@ def _residual(evidence: IdentificationEvidence) -> Residual:
         chi_square=tests.chi_square,
         edges=len(prepared.steps.edges),
         whiteness_p=tests.whiteness,
-        independence_p=evidence.searched.diagnostics.independence,
+        independence_p=evidence.searched.p_value,
         response_agreement=evidence.response_difference,
         timing_scatter_s=tests.timing,
         axis_timing_scatter_s=tests.axis_timing,
