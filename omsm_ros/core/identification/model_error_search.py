@@ -97,7 +97,7 @@ def search_model_errors(
     diagnostics = search.diagnostics()
     for _ in range(_MOST_ROUNDS):
         shown = list(filter(search.new, diagnostics.significant(search.refused | search.settled)))
-        # Whatever is added after a stiffness that grows, which has no model, would imitate it.
+        # A stiffness that grows has no model, and a term that is added after it would imitate it.
         if not shown or shown[0].term.family == STIFFENING:
             break
         # Without budget a nuisance term is still fitted to the structure that was chosen.
@@ -106,7 +106,7 @@ def search_model_errors(
         if search.add(diagnostics, shown):
             diagnostics = search.diagnostics()
     left = diagnostics.significant(search.settled)
-    # What has a model was tried, or the search did not come to it: it names no cause.
+    # A family with a model was tried, or the search did not come to it: it names no cause.
     stiffening = left[0] if left and left[0].term.family == STIFFENING else None
     return SearchResult(
         search.prepared,
