@@ -279,7 +279,7 @@ class _Phases:
     changes slowly until it jumps by a whole period. That looks like a missed trigger. With the jump
     a poll takes a sample more or less, so equal steps before it show polls whose arrivals scatter.
 
-    locked: to the trigger;  ages: so are polls, since not all steps are multiples of a block
+    ages: arrivals are locked to it, and are polls: not all steps are multiples of a block
     """
 
     def __init__(self, period: float) -> None:
@@ -288,7 +288,7 @@ class _Phases:
         self._block, self._since, self._steps = 0, 0.0, 0
         self._begin, self._lates = -math.inf, list[float]()  # of the current span
         self._means: deque[tuple[complex, ...]] = deque(maxlen=_LATEST)  # [s], 1/n, harmonics
-        self._in_step = self._polled = self._uneven = self.locked = self.ages = False
+        self._in_step = self._polled = self._uneven = self.ages = False
 
     def add(self, due: float, arrival: float) -> None:
         """Enter an arrival;  due: count times period [s]."""
@@ -305,8 +305,7 @@ class _Phases:
                 self._end_span(np.array(self._lates))
             self._begin, self._lates = arrival, []
         self._lates.append(late)
-        self.locked = self._in_step or self._polled
-        self.ages = self.locked and self._uneven
+        self.ages = self._uneven and (self._in_step or self._polled)
 
     def _end_span(self, late: FloatArray) -> None:
         early = late[late < late.min() + _EARLY_PERIODS]  # a delay says nothing of the age
@@ -417,7 +416,7 @@ class _Reference:
         if self.proven:
             self._set_line(known)
             rest = (late - self._line[0] - self._line[1] * begin)[known:][-_SHOWING:] / self._period
-            if self._phases.locked and len(rest) == _SHOWING:
+            if self._phases.ages and len(rest) == _SHOWING:
                 self.lost |= rest.min() > 1 - _AGE_PERIODS and np.ptp(rest) < _AGE_PERIODS
         shown = not self.proven and known == len(begin)  # by steady motion
         if self.lost or len(begin) < max(_LEAST_SPANS, 0 if shown else known + _SHOWING):
@@ -437,7 +436,7 @@ class _Reference:
             self.least_missed = max(math.ceil(scatter / self._period + 0.5), 1)
             if abs(drift) > LARGEST_CRYSTAL_DRIFT and waited < _OTHER_RATE_S:
                 return  # missed triggers would look alike
-        locked = self._phases.locked or abs(drift) > LARGEST_CRYSTAL_DRIFT
+        locked = self._phases.ages or abs(drift) > LARGEST_CRYSTAL_DRIFT
         missed = self._settle(known, locked) if self.least_missed and not shown else 0
         if missed == 0 or (missed and self.proven):
             self.proven, self.in_time = True, self._judged
@@ -482,7 +481,6 @@ class _Reference:
         seen = np.max([*likely.values()], axis=0) < -_EXCLUDED
         off = np.flatnonzero(sliding_window_view(rest, _SHOWING).min(axis=1) > _AGE_PERIODS)
         aged = (shifted(first, 1, first + _SHOWING)[0] - none > -_EXCLUDED for first in off)
-        locked &= not self._phases.locked or self._phases.ages
         sure = most < _POSSIBLE and not (locked and any(aged)) and seen[-_OPEN:].any()
         unseen = np.diff(begin)[steps.start - 1 :][:-_OPEN] @ ~seen[:-_OPEN]
         return 0 if sure and unseen <= _UNSEEN * (begin[-1] - begin[0]) else None

@@ -273,8 +273,9 @@ class BlockCutter:
         if not self._channels.timed:
             return due
         before, self._latest = self._latest, int(times[-1])
-        if self._latest == before:
-            return times  # the clock of the device stands still, as its rate will show
+        if self._latest == before or self._evenly_wrong:
+            self._usual = None
+            return times  # the clock of the device stands still, or its rate is another one
         usual = int(np.median(times - due))
         if not (run.restarted or after_silence or self._usual is None):
             begun, arrived = self._usual

@@ -456,7 +456,8 @@ class SteadyMotion:
             if len(places) and run >= _STEADY_STEPS:
                 step, jump = (int(value) for value in steps[places[0] : places[0] + 2, axis])
                 times = round(jump / step)
-                if times > 1 and abs(jump / step - times) <= _WHOLE_PART:
+                whole = times > 1 and abs(jump / step - times) <= _WHOLE_PART
+                if whole and not (self.doubtful and run <= self._jump[1]):
                     self._jump = (axis, run, step, times - 1, self.count + int(places[0]))
                     self.doubtful = True
         self._last, self._step = counts[-1:], steps[-1]

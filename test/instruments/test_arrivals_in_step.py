@@ -93,6 +93,25 @@ def test_nor_is_a_block_after_a_missed_trigger(seed: int) -> None:
     assert max(confirmed, default=0.0) < 6.01 < max(taken)
 
 
+@pytest.mark.parametrize(("size", "missed"), [(2, 1), (10, 2), (50, 3)])
+def test_blocks_that_are_sent_at_once_show_how_many_were_missed(size: int, missed: int) -> None:
+    """They stay of equal size, where polls would take fewer samples, so no age has changed."""
+    random, detector = np.random.default_rng(size), MissedTriggerDetector(PERIOD)
+    counts = np.arange(1, 15_000 // size) * size
+    triggers = counts + missed * (counts > 5000)
+    late = random.exponential(1e-4, len(counts))
+    found, resumed = 0, math.inf
+    for count, trigger, delay in zip(counts, triggers, late, strict=True):
+        arrival = float(trigger * PERIOD * (1 + 2e-5) + delay)
+        if detector.confirms(float(count + found) * PERIOD, UPTIME_S + arrival):
+            assert count + found == trigger
+            resumed = min(resumed, arrival) if found else resumed
+        else:
+            found += detector.forget_missed()
+    assert found == missed
+    assert resumed < 7.0
+
+
 def test_a_missed_trigger_is_seen_on_a_grid_of_half_a_period() -> None:
     """A USB frame of 1 ms becomes early enough for the age of a 500 Hz trigger when one is missed.
 

@@ -81,6 +81,16 @@ def test_an_axis_that_turns_shows_missed_triggers_where_arrivals_cannot(
     assert cutter.detector.missed == len(missed)
 
 
+def test_an_axis_that_is_even_by_chance_hides_none_that_another_shows() -> None:
+    """A sine has nearly equal steps about its greatest speed, but not for long enough after."""
+    sine = np.rint(1e6 * np.sin(2 * np.pi * (ALL - 1490) / 160)).astype(np.int64)
+    number, true, _, cutter = moved(TURNING, without(1500), z=sine)
+    np.testing.assert_array_equal(number, true)
+    assert true[-1] > 3900
+    assert cutter.detector is not None
+    assert cutter.detector.missed == 1
+
+
 def test_it_shows_at_once_that_none_was_missed_at_a_reset_of_the_counter() -> None:
     number, true, now, _ = moved(TURNING, ALL, reset=2000)
     np.testing.assert_array_equal(number, true)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -109,6 +111,17 @@ def test_a_wrong_nominal_period_is_noticed(deviation: float, warnings: int) -> N
     assert device.statistics.period_deviation == pytest.approx(deviation, abs=1e-8)
     said = device.trouble or device.caution
     assert ("sample_period" in said) == (warnings > 0)
+
+
+def test_another_rate_is_seen_in_large_portions_too() -> None:
+    """Their times are far from those of the counts, but not because the line damaged them."""
+    frames = frames_of(np.arange(4000))
+    frames["device_time"] = np.arange(4000) * MS // 2
+    edges = [*range(0, 2000, 50), 2000, 2600, 2700, 3500, 4000]
+    portions = [encode_frames(frames[a:b]) for a, b in pairwise(edges)]
+    found, device = run(*portions)
+    assert not found
+    assert "2000 Hz" in device.trouble
 
 
 # Connection.
