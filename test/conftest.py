@@ -38,6 +38,7 @@ def pytest_configure():
 def pytest_collection_finish():
     gc.freeze()  # nor is it looked for while they run
     gc.enable()
+    gc.set_threshold(50_000)  # of 700: a tree of the syntax of a file has a hundred times as many
 
 
 _APPROX = pytest.approx

@@ -33,7 +33,7 @@ from .scripted_stream import Script
 
 # `OMSM_MISSED_TRIGGERS=200` tries as many.
 CASES = int(os.environ.get("OMSM_MISSED_TRIGGERS", "1"))
-PERIOD, SECONDS = 1e-3, 9.0
+PERIOD, SECONDS = 1e-3, 7.0
 UPTIME_S = 123_456.0  # of the host, from which its monotonic clock counts
 EPOCH_NS = 1_700_000_000 * 10**9
 COLUMNS = ("sequence", "x", "y", "z", "b", "c")
