@@ -103,7 +103,11 @@ class DeviceReader:
         self.state, any_came = State.CONNECTING, False
         try:
             self._device.open()
-            self._connected()
+            self.connections += 1
+            self.state = State.READING
+            if not self._unproven:
+                self._tell("")
+            self._when_connected()
             while not stop.is_set():
                 self._do_requests()
                 blocks = self._device.poll(_READ_S)
@@ -123,13 +127,6 @@ class DeviceReader:
         self.state = State.LOST
         known = isinstance(err, DeviceError | ConfigurationError)
         self._tell(str(err) if known else defect(err))
-
-    def _connected(self) -> None:
-        self.connections += 1
-        self.state = State.READING
-        if not self._unproven:
-            self._tell("")
-        self._when_connected()
 
     def _deliver_blocks(self, blocks: Sequence[BlockPair]) -> None:
         if blocks:

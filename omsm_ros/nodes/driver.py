@@ -38,16 +38,8 @@ from omsm_ros.nodes.topics import FRAME_PREFIX, LATCHED_QOS, publish_on
 from omsm_ros.quantities import Parameter
 
 _FAULTS = (
-    "bad",
-    "lost",
-    "losses",
-    "malformed",
-    "restarts",
-    "spoilt",
-    "period_w",
-    "unknown",
-    "missed",
-    "overruns",
+    *("bad", "lost", "losses", "malformed", "restarts"),
+    *("spoilt", "period_w", "unknown", "missed", "overruns"),
 )
 _END_S = 5.0
 # A dark reference takes some three seconds; more if the device is slow to answer.

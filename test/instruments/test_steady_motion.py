@@ -81,7 +81,7 @@ def test_an_axis_that_turns_shows_missed_triggers_where_arrivals_cannot(
     assert cutter.detector.missed == len(missed)
 
 
-def test_an_axis_that_is_even_by_chance_hides_none_that_another_shows() -> None:
+def test_an_axis_that_is_even_by_chance_decides_nothing() -> None:
     """A sine has nearly equal steps about its greatest speed, but not for long enough after."""
     sine = np.rint(1e6 * np.sin(2 * np.pi * (ALL - 1490) / 160)).astype(np.int64)
     number, true, _, cutter = moved(TURNING, without(1500), z=sine)

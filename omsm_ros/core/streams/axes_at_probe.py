@@ -117,14 +117,8 @@ def _at(
         if inside.any():
             seen = [track.spline(time[inside] + node) for node in nodes]
             values[inside] = np.average(seen, axis=0, weights=weights)
-    channels = {name: values[:, i].copy() for i, name in enumerate(_AXES)}
-    return AxisBlock(
-        stamp_ns=block.stamp_ns,
-        first_sample=block.first_sample,
-        sample_period=block.sample_period,
-        parts=block.parts,
-        **channels,
-    )
+    common = {n: getattr(block, n) for n in ("stamp_ns", "first_sample", "sample_period", "parts")}
+    return AxisBlock(**common | {name: values[:, i].copy() for i, name in enumerate(_AXES)})
 
 
 def _sessions(blocks: Iterable[B]) -> list[list[B]]:

@@ -54,7 +54,7 @@ _WANDER_S = 30.0
 _MOST_STAMPS = 1024
 # Standard deviations of single stamps that the median of several does not reach.
 _SEVERAL_TIMES = 3.0
-# A slip is found within this number of verdicts; skews before them show how clocks move.
+# Number of verdicts in the first judged span, within which a slip is found.
 _FOUND_IN = 5
 
 
@@ -164,6 +164,7 @@ class TriggerSlipDetector:
         # Skew at each verdict of the last half minute without a slip [ns].
         self._wander: deque[float] = deque(maxlen=round(_WANDER_S / _STRIDE_S))
         self._usual = math.nan  # skew [ns]
+        self._found_in = _FOUND_IN  # verdicts; skews before them show how clocks move
 
     @property
     def state(self) -> TriggerSlip:
@@ -215,12 +216,8 @@ class TriggerSlipDetector:
         """Return whether the pairs that still wait slipped, as far as their stamps show."""
         since = self._start - 1 if self._starting else min(self._shown)
         few = self._starting and min(self._stamps) < _LEAST_STAMPS
-        if (
-            self._state.samples
-            or self._odd_at <= since
-            or few
-            or not self._seen.stamps_follow_counts(self._period_ns)
-        ):
+        known = self._state.samples or self._odd_at <= since or few
+        if known or not self._seen.stamps_follow_counts(self._period_ns):
             return bool(self._state.samples)
         rows = self._seen.after(since)
         found = self._verdict(rows[:, 1] / self._period_ns)
@@ -272,22 +269,25 @@ class TriggerSlipDetector:
                 self._judge(count)
             if not self._state.samples:  # a slip in the newest ones is not found yet
                 self._wander.append(skew)
-                if len(self._wander) >= 3 * _FOUND_IN:
-                    self._usual = median(np.array([*self._wander][-2 * _FOUND_IN : -_FOUND_IN]))
+                if len(self._wander) >= 3 * (latest := self._found_in):
+                    self._usual = median(np.array([*self._wander][-2 * latest : -latest]))
         time = axes.stamp_of(a, count, period_ns) or 0.0
         self._seen.add(count, skew, *begun, time)
         self._odd |= off and not early_days
 
     def _off(self, skew: FloatArray) -> BoolArray:
         """Return which ``skew`` (n,) of single stamps [ns] may be of a slip."""
-        limit = self._period_ns / 2 + _SEVERAL_TIMES * _scatter(np.array(self._wander))
+        limit = self._period_ns / 2 + _SEVERAL_TIMES * self._scatter()
         far = abs(skew) >= self._steady() * self._period_ns
         return np.asarray(far | (abs(skew - self._usual) >= limit))
 
     def _judge(self, count: int) -> None:
+        rows = self._recent()
+        if rows is not None:  # long blocks make the judged span longer
+            strides = rows[:, 0] // (_STRIDE_S * NANOSECONDS_PER_S / self._period_ns)
+            self._found_in = max(int(np.count_nonzero(np.diff(strides))) + 1, _FOUND_IN)
         if not (self._odd or self._state.samples or self._starting):
             return
-        rows = self._recent()
         if rows is None or not self._seen.stamps_follow_counts(self._period_ns):
             self._state, self._odd = TriggerSlip(), True
             if rows is not None:
@@ -309,12 +309,25 @@ class TriggerSlipDetector:
         first = self._start + _FIRST_S * NANOSECONDS_PER_S / self._period_ns
         return self._seen.recent(first, self._since, _LEAST_STAMPS)
 
+    def _scatter(self) -> float:
+        """Return the scatter of the skews at verdicts [ns], at least the error of their clocks.
+
+        A slip in the newest skews is not a movement of clocks.
+        """
+        if not self._wander:
+            return 0.0
+        wander = np.array(self._wander)
+        known = wander[: -self._found_in]
+        arrivals = np.arange(1, len(known) + 1) / len(wander)
+        uncertainty = float(np.max(abs(known - known[-1:]) * arrivals, initial=0.0))
+        return max(spread_about_median(wander), uncertainty)
+
     def _steady(self) -> float:
         return self._trigger.least_slip(self._period_ns / NANOSECONDS_PER_S)
 
     def _limit(self, window: FloatArray) -> float:
         """Return the skew that is a slip [samples]."""
-        scatter = _scatter(np.array(self._wander) / self._period_ns)
+        scatter = self._scatter() / self._period_ns
         return self._steady() + _SEVERAL_TIMES * max(spread_about_median(window), scatter)
 
     def _verdict(self, window: FloatArray, above: float | None = None) -> TriggerSlip:
@@ -332,16 +345,3 @@ class TriggerSlipDetector:
             samples = round(change) or int(math.copysign(1, change))
             found = TriggerSlip(samples, 1, skew * period, self._trigger)
         return replace(found, seen_from=math.ceil(limit)) if found.samples else found
-
-
-def _scatter(wander: FloatArray) -> float:
-    """Return the scatter of the skews ``wander`` (n,), at least the error their clocks may have.
-
-    A slip in the newest skews is not a movement of clocks.
-    """
-    if not len(wander):
-        return 0.0
-    known = wander[:-_FOUND_IN]
-    arrivals = np.arange(1, len(known) + 1) / len(wander)
-    uncertainty = float(np.max(abs(known - known[-1:]) * arrivals, initial=0.0))
-    return max(spread_about_median(wander), uncertainty)

@@ -50,10 +50,8 @@ class CsvStreamEmulator(Instrument):
         rows = np.zeros(len(measured), row_dtype(COLUMNS))
         rows["sequence"], rows["device_time"] = counters, times_ns
         rows["status"] = measured.status
-        nothing = np.isnan(measured.distance)
-        rows["distance"] = np.where(
-            nothing, self._scaling.probe.invalid, measured.distance / NANOMETRE_M
-        )
+        distance, invalid = measured.distance / NANOMETRE_M, self._scaling.probe.invalid
+        rows["distance"] = np.where(np.isnan(distance), invalid, distance)
         for name in AXES:
             axis = getattr(self._scaling, name)
             rows[name] = measured.axes[name] * axis.counts_per_unit

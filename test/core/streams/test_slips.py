@@ -154,6 +154,17 @@ def test_missed_triggers_are_found_within_a_second(
     assert f"slipped by {done.slips[-1]} samples" in str(done.watch.found)
 
 
+@pytest.mark.parametrize("length", [100, 250])
+def test_a_slip_of_long_blocks_is_no_movement_of_clocks(length: int) -> None:
+    """Eight blocks of 0.4 or 1 s last longer than the span of a verdict otherwise is."""
+    lacking = without(ALL, 3000, 3)
+    axes, distance = Device(ALL, 20, 4e-3, 1e-5), Device(lacking, length, 4e-3, 1e-5, seed=1)
+    done = join(axes.blocks(), distance.blocks())
+    assert len(done.wrong) == 0
+    assert done.slips[-1] == -3
+    assert done.axes[-1] > 3000 - 2 * length
+
+
 @pytest.mark.parametrize("late", [1, 10, 300])
 def test_nothing_is_paired_with_a_counter_that_was_started_late(late: int) -> None:
     done = join(Device(ALL).blocks(), Device(ALL[late:]).blocks())
