@@ -41,7 +41,8 @@ COLUMNS = ("--input", "valve", "--output", "flow", "--period", 0.1)
 def identified(table):
     """The facts and the file of a model."""
     out, said = table.parent / "model.json", io.StringIO()
-    words = ("identify", table, *COLUMNS, "--hold", "zero-order", "--out", out, "--json")
+    words = ("identify", table, *COLUMNS, "--hold", "zero-order", "--out", out, "--json",
+             "--report", table.parent / "page")  # fmt: skip
     with contextlib.redirect_stdout(said):
         assert cli.main([str(a) for a in words]) == 0
     return json.loads(said.getvalue()), out
@@ -80,11 +81,9 @@ def test_an_order_and_people(capsys, table, tmp_path):
         assert text in said.out
 
 
-def test_a_model_is_drawn_and_runs_over_another_record(capsys, table, tmp_path):
-    model, page = tmp_path / "model.json", tmp_path / "page"
-    arguments = ("--hold", "zero-order", "--out", model, "--report", page, "--json")
-    _, said = run(capsys, table, *COLUMNS, *arguments)
-    assert json.loads(said.out)["report"] == str(page / "model.html")
+def test_a_model_is_drawn_and_runs_over_another_record(capsys, table, identified, tmp_path):
+    (facts, model), page = identified, table.parent / "page"
+    assert facts["report"] == str(page / "model.html")
     assert (page / "model.html").read_text().count("<figure>") == 3
     rng = np.random.default_rng(7)
     u = np.repeat(rng.choice([0.0, 2.0], 100), 6)
@@ -112,7 +111,7 @@ def test_two_inputs_of_two_records_give_one_model(capsys, tmp_path):
         path.write_text("\n".join(["x,c,probe", *rows]))
     columns = ("--input", "x,c", "--output", "probe")
     options = (*columns, "--period", 0.1, "--hold", "zero-order", "--out", tmp_path / "m.json")
-    status, said = run(capsys, *paths, *options, "--json")
+    status, said = run(capsys, *paths, *options, "--max-delay", 0, "--json")
     assert status == 0, said.err
     facts = json.loads(said.out)
     assert facts["samples"] == {"received": 1200, "compared": 1196}
@@ -185,7 +184,7 @@ def test_a_rejected_model_replaces_none(capsys, tmp_path):
     np.savetxt(path, walk, delimiter=",", header="u,y", comments="")
     out.write_text("a good one")
     arguments = ("--input", "u", "--output", "y", "--period", 1, "--hold", "zero-order")
-    status, said = run(capsys, path, *arguments, "--out", out)
+    status, said = run(capsys, path, *arguments, "--max-delay", 0, "--out", out)
     assert status == 2
     assert "rejected" in said.err
     assert out.read_text() == "a good one"

@@ -10,12 +10,12 @@ from omsm_ros.twin.cell import Cell, Probe, Recording, record
 from .corrected_runs import SPIRAL
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def scan() -> Recording:
     return record(Cell(), SPIRAL, PAPER_MIRROR)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def quiet_scan() -> Recording:
     probe = Probe(noise=0.0, resolution=0.0)
     return record(Cell(probe=probe, encoder_noise=0.0), SPIRAL, PAPER_MIRROR)

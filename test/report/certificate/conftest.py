@@ -13,38 +13,38 @@ from omsm_ros.report.certificate.page import render
 from omsm_ros.report.page_parts import Issue
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def record(step_test):
     return assemble([step_test.axes], [step_test.distance])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def identified(record):
     return identify(record, order=2, settings={"fixture": "plate <3>"})
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def calibration(identified):
     return identified.calibration
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def fitted(identified):
     return fitted_record(identified)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def figures(calibration, fitted):
     return certificate_figures_of(calibration, fitted)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def certificate(calibration, figures):
     return calibration, Issue(
         date="2025-01-31 12:00 UTC", source="steps.mcap", version="0.1.0", figures=figures
     )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def page(certificate):
     return Page(render(*certificate))
