@@ -83,9 +83,9 @@ def write_certificate(out: Path, identified: Identification, *, source: str = ""
     from omsm_ros.report.page_parts import Issue
 
     calibration = identified.calibration
-    figures = certificate_figures_of(calibration, fitted_record(identified))
-    issue = Issue(date=now_text(), source=source, version=__version__, figures=figures)
     with result_folder(out, (PAGE, DCC)) as folder:
+        figures = certificate_figures_of(calibration, fitted_record(identified))
+        issue = Issue(date=now_text(), source=source, version=__version__, figures=figures)
         save_text(folder / DCC, render_dcc(calibration, __version__))
         save_text(folder / PAGE, render(calibration, issue))
     return out / PAGE

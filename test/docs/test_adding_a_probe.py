@@ -21,7 +21,7 @@ def test_the_page_runs_from_top_to_bottom():
     settings = names["BlockSettings"](sample_period=0.02, block_size=10)
     polled = names["PolledLamp"](line, settings, line.clock.nanoseconds, line.clock)
     polled.open()
-    blocks = [block for _ in range(4000) for block in polled.poll(0.05)]
+    blocks = [block for _ in range(1500) for block in polled.poll(0.05)]
     polled.close()
     counts = np.concatenate([b.distance.first_sample + np.arange(len(b.distance)) for b in blocks])
     read = np.concatenate([b.distance.distance for b in blocks])
