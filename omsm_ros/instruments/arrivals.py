@@ -59,7 +59,8 @@ class DeviceClock:
         self._spans: deque[tuple[float, float, float]] = deque(maxlen=round(WINDOW_S / SPAN_S))
         self._origin = self._newest = (0, 0)
         self._offset = self._slope = self._usual = 0.0
-        self._late_since: tuple[float, float] | None = None  # all arrivals [device, arrival; s]
+        self._late_since: tuple[float, float, float] | None = None  # device, arrival, lateness [s]
+        self._evenly_late = False  # as after a pause, not at another rate
 
     @property
     def drift(self) -> float | None:
@@ -109,9 +110,10 @@ class DeviceClock:
             self._spans.append((device, device, late))
             while device + late - sum(self._spans[0][1:]) > WINDOW_S:
                 self._spans.popleft()
-            _, x, y = np.array(self._spans).T
-            self._offset, self._slope, rest = line_below(x, y)
-            self._usual = float(np.median(rest))
+            if not self._evenly_late:
+                _, x, y = np.array(self._spans).T
+                self._offset, self._slope, rest = line_below(x, y)
+                self._usual = float(np.median(rest))
         self._offset += min(late - self._offset - self._slope * device, 0.0)
 
     def _stepped(self, device: float, late: float) -> bool:
@@ -120,9 +122,10 @@ class DeviceClock:
         if self._spans and not -_EARLY_S < off < _OLDEST_S:
             return True
         if not self._spans or off < _STEP_S + 2 * self._usual:
-            self._late_since = None
+            self._late_since, self._evenly_late = None, False
             return False
-        since, arrived = self._late_since = self._late_since or (device, device + late)
+        since, arrived, first = self._late_since = self._late_since or (device, device + late, off)
+        self._evenly_late = off < first + _STEP_S
         return min(device - since, device + late - arrived) > _STEP_AFTER_S
 
 

@@ -256,6 +256,19 @@ def test_samples_that_were_overwritten_are_a_loss(daq):
         source.read(0.0)
 
 
+def test_a_converter_that_was_unplugged_is_an_error_of_the_device(daq):
+    source = NidaqInput("daq://Dev1/ai0", 1)
+    source.open(2000.0)
+
+    def gone():
+        raise DaqError("Device cannot be accessed.")
+
+    daq["task"].close = gone
+    source.close()
+    with pytest.raises(DeviceError, match="is not open"):
+        source.read(0.0)
+
+
 def test_without_the_driver_the_remedy_is_reported():
     pytest.importorskip("nidaqmx", reason="nidaqmx is an optional package")
     with pytest.raises(DeviceError, match="NI-DAQmx"):

@@ -67,6 +67,19 @@ def test_late_arrivals_of_a_busy_host_do_not_pull() -> None:
     assert abs(stamps - host)[2000:].max() < 1.0 * MS
 
 
+@pytest.mark.parametrize("begun_s", [0.5, 1.5, 3.0])
+@pytest.mark.parametrize("pause_ms", [33, 90])
+def test_a_pause_of_the_trigger_soon_after_the_start_is_no_rate(
+    begun_s: float, pause_ms: int
+) -> None:
+    """A device without time counts periods, so that its count is late from the pause on."""
+    device, host, arrival = link(2000, jitter=0.2)
+    paused = (device > begun_s * 1e9) * pause_ms * MS
+    stamps = stamps_of(DeviceClock(), device, arrival + paused)
+    later = device > (begun_s + 3) * 1e9
+    assert abs(stamps - host - paused)[later].max() < 1.0 * MS
+
+
 def test_a_drift_that_changes_is_followed() -> None:
     """A crystal that warms up by 10 ppm in five minutes."""
     device = np.arange(60_000, dtype=np.int64) * 5 * MS

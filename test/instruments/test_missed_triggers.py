@@ -6,6 +6,7 @@ Both wires are written here, in plain numpy and text: a probe that sends its own
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 from dataclasses import dataclass
@@ -432,18 +433,22 @@ def test_a_trigger_missed_at_or_after_a_reset_is_seen(after: float, level: float
     assert cutter.unconfirmed or cutter.detector.missed == 2
 
 
-def followed_to(late: Any) -> CsvStreamDevice:
-    """A device of 1 kHz that sent ten lines each 10 ms for 6 s, ``late(taken)`` [s]."""
+def followed_to(late: Any, fewer_at: int = -1) -> CsvStreamDevice:
+    """A device of 1 kHz that sent ten lines each 10 ms for 6 s, ``late(taken)`` [s].
+
+    fewer_at: portion of only nine lines
+    """
     now = [UPTIME_S]
 
     class Late(Script):
         def read(self, timeout: float) -> bytes:
-            taken = (count[0] + 10) * PERIOD
+            size = 10 - (next(portions) == fewer_at)
+            count[0] += size
+            taken = count[0] * PERIOD
             now[0] = max(now[0], UPTIME_S + taken + late(taken))
-            count[0] += 10
-            return b"".join(b"%d 0 0 0 0 0\n" % k for k in range(count[0] - 10, count[0]))
+            return b"".join(b"%d 0 0 0 0 0\n" % k for k in range(count[0] - size, count[0]))
 
-    count = [0]
+    count, portions = [0], itertools.count()
     settings = CsvSettings(columns=COLUMNS, sample_period=PERIOD, block_size=10)
     device = CsvStreamDevice(Late(), settings, lambda: round(now[0] * 1e9), lambda: now[0])
     device.open()
@@ -460,6 +465,9 @@ def test_samples_that_arrive_too_unevenly_are_withheld_with_the_remedy() -> None
 
 
 def test_polls_in_step_with_the_trigger_need_a_restart_after_a_missed_one() -> None:
-    device = followed_to(lambda taken: PERIOD * (0.4 + (taken > 3)))
+    device = followed_to(lambda taken: PERIOD * (0.4 + (taken > 3)), fewer_at=300)
     assert 2000 < device.statistics.delivered <= 3000
     assert re.search(r"do not show how many.*restart the counters of both", device.trouble)
+    blocks = followed_to(lambda taken: PERIOD * (0.4 + (taken > 3)))
+    assert (blocks.statistics.missed, blocks.trouble) == (1, "")
+    assert blocks.statistics.delivered > 5000

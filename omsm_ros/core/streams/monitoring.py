@@ -97,11 +97,9 @@ class LoadMeter:
         found = {"cpu_share": round(share, 4)}
         if self._blocks:
             points = np.percentile(self._latencies[: self._blocks], (50, 99, 100))
-            scaled = points * NANOSECOND_S / MILLISECOND_S
+            values = np.round(points * NANOSECOND_S / MILLISECOND_S, 3).tolist()
             names = ("latency_median_ms", "latency_p99_ms", "latency_max_ms")
-            found |= {
-                name: round(float(value), 3) for name, value in zip(names, scaled, strict=True)
-            }
+            found |= zip(names, values, strict=True)
         return found
 
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from types import MappingProxyType
 from typing import Any, TypeAlias
@@ -91,11 +92,9 @@ class NidaqInput:
             raise DeviceError(f"{self.name} is not open")
         nidaqmx = _nidaqmx()
         try:
-            waiting = int(self._task.in_stream.avail_samp_per_chan)
-            if not waiting:
+            if not self._task.in_stream.avail_samp_per_chan:
                 time.sleep(min(timeout, 0.02))
-                waiting = int(self._task.in_stream.avail_samp_per_chan)
-            if not waiting:
+            if not (waiting := int(self._task.in_stream.avail_samp_per_chan)):
                 return np.empty((0, self._channels))
             values = self._task.read(number_of_samples_per_channel=waiting, timeout=timeout + 1.0)
         except nidaqmx.errors.Error as err:
@@ -111,7 +110,8 @@ class NidaqInput:
         """Stop; does nothing when not open."""
         if self._task is not None:
             task, self._task = self._task, None
-            task.close()
+            with suppress(Exception):  # a converter that was unplugged refuses it
+                task.close()
 
 
 class SyntheticInput:
