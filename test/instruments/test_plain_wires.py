@@ -179,7 +179,7 @@ def found_of(decoder: Any, portions: list[bytes], values: Callable[..., Any]) ->
 
 
 @pytest.mark.parametrize("wire", WIRES, ids=lambda wire: wire.__name__)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *soaked(1, 2)])
 def test_every_value_arrives(wire: Any, seed: int) -> None:
     make, sent, drawn, values = wire(random.Random(seed))
     decoder = synchronised(make())
@@ -199,7 +199,7 @@ def test_a_cut_at_any_byte_changes_nothing(wire: Any) -> None:
 
 
 @pytest.mark.parametrize("wire", WIRES, ids=lambda wire: wire.__name__)
-@pytest.mark.parametrize("seed", [0, 1, 2, *soaked(*range(3, 12))])
+@pytest.mark.parametrize("seed", [0, *soaked(*range(1, 12))])
 def test_after_noise_the_place_is_found_again(wire: Any, seed: int) -> None:
     """Noise at the start costs no more than what stands next to it, and invents nothing."""
     draw = random.Random(seed)

@@ -25,8 +25,9 @@ def second_order(frequency: float, damping: float, delay: float = 0.0) -> Transf
     return TransferFunction.from_ascending([1.0], [1.0, 2 * damping / omega, 1 / omega**2], delay)
 
 
-@pytest.mark.parametrize("period", [1e-3, 1e-4, 1 / 70e3])
-@pytest.mark.parametrize("order", [1, 2, 3, 5, 7])
+@pytest.mark.parametrize(
+    ("period", "order"), [(1e-3, 5), *((1 / 70e3, order) for order in (1, 2, 3, 5, 7))]
+)
 def test_dc_gain_is_that_of_the_continuous_system(period: float, order: int) -> None:
     assert abs(discretise(PAPER, period, order).response(np.zeros(1))[0] - 1) < 1e-12
 

@@ -43,11 +43,10 @@ def test_twice_as_much_is_twice_as_much_to_the_last_bit(dynamics: TransferFuncti
 
 
 @ALL
-@pytest.mark.parametrize("wait", [1, 7, 100])
-def test_a_filter_is_the_same_at_any_time(dynamics: TransferFunction, wait: int) -> None:
-    later = filtered(dynamics, np.concatenate([np.zeros(wait), NOISE[0]]))
-    assert not np.any(later[:wait])
-    assert np.array_equal(later[wait:], filtered(dynamics, NOISE[0]))
+def test_a_filter_is_the_same_at_any_time(dynamics: TransferFunction) -> None:
+    later = filtered(dynamics, np.concatenate([np.zeros(7), NOISE[0]]))
+    assert not np.any(later[:7])
+    assert np.array_equal(later[7:], filtered(dynamics, NOISE[0]))
 
 
 @ALL

@@ -147,8 +147,9 @@ def test_lines_scanned_at_other_speeds_count_by_their_area() -> None:
     assert np.mean(y > 0) > 0.75
 
 
-@pytest.mark.parametrize("lines", [8, 12, 16, 17, 31, 100])
-@pytest.mark.parametrize("slower", [1, 4])
+@pytest.mark.parametrize(
+    ("lines", "slower"), [(8, 1), (8, 4), (12, 4), (16, 4), (17, 4), (31, 4), (100, 4)]
+)
 def test_of_few_lines_each_stands_for_the_way_to_the_next(lines: int, slower: int) -> None:
     """The mean square over a square by the trapezoidal rule, whatever the lines' speed was."""
     rows = np.linspace(-1.0, 1.0, lines)

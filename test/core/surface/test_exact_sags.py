@@ -33,8 +33,18 @@ def _fifty_digits():
         yield
 
 
-@pytest.mark.parametrize("radius", [9e-3, -0.02, 0.5, -30.0, 1e5])
-@pytest.mark.parametrize("k", [-3.0, -1.0, -0.25, 0.0])
+@pytest.mark.parametrize(
+    ("radius", "k"),
+    [
+        (9e-3, -3.0),
+        (9e-3, -1.0),
+        (9e-3, 0.0),
+        (-0.02, -0.25),
+        (0.5, 0.0),
+        (-30.0, -3.0),
+        (1e5, 0.0),
+    ],
+)
 def test_a_conic_is_known_to_its_last_digits_at_any_radius(radius, k):
     inside = 0.99 * radius**2 > X**2 + Y**2
     found = Asphere(radius, k).height(X, Y)
@@ -124,7 +134,7 @@ SHAPES = [
 
 
 @pytest.mark.parametrize("surface", SHAPES, ids=lambda s: type(s).__name__)
-@pytest.mark.parametrize("angle", [0.4, 2.0, -np.pi / 2])
+@pytest.mark.parametrize("angle", [0.4, -np.pi / 2])
 def test_a_shape_of_revolution_does_not_know_how_it_is_turned(surface, angle):
     c, s = np.cos(angle), np.sin(angle)
     u, v = c * X - s * Y, s * X + c * Y
