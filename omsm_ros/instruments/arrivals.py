@@ -60,7 +60,7 @@ class DeviceClock:
         self._origin = self._newest = (0, 0)
         self._offset = self._slope = self._usual = 0.0
         self._late_since: tuple[float, float, float] | None = None  # device, arrival, lateness [s]
-        self._evenly_late = False  # as after a pause, not at another rate
+        self._evenly_late = False  # as after a pause, not on a busy host
 
     @property
     def drift(self) -> float | None:
@@ -125,7 +125,7 @@ class DeviceClock:
             self._late_since, self._evenly_late = None, False
             return False
         since, arrived, first = self._late_since = self._late_since or (device, device + late, off)
-        self._evenly_late = off < first + _STEP_S
+        self._evenly_late = abs(off - first) < _STEP_S and (self._evenly_late or off == first)
         return min(device - since, device + late - arrived) > _STEP_AFTER_S
 
 
