@@ -146,9 +146,6 @@ class PacketFinder:
 
 # Arrivals are uneven, so a gap and the time that passed may differ by this much [s].
 _SLACK_S = 0.5
-# A step of time over missed triggers differs by less from whole periods [period]; a longer step is
-# a pause of the trigger [s].
-_WHOLE_STEP, _MISSED_S = 0.02, 0.1
 # Copies of samples that were sent before are recognised this far back.
 _RECENT_SAMPLES = 1024
 
@@ -188,14 +185,12 @@ class SequenceTracker:
 
     A repeated sample or number is a duplicate. A counter or time that falls back, or a counter at
     zero after a silence, is a restart of the device; its own number counts from there. Any other
-    number that is not the next one is a gap, and so are triggers that the time shows as missed.
+    number that is not the next one is a gap.
     """
 
-    def __init__(self, counting: Counting, period: float = np.inf) -> None:
-        """period: of a trigger, so that times show which ones were missed [s]."""
+    def __init__(self, counting: Counting) -> None:
         self.duplicates = self.lost = self.gaps = self.restarts = self.spoilt = 0
         self._counting = counting
-        self._trigger = period if counting.timed and not counting.period else np.inf
         self._raw = self._time = self._counter = 0
         self._begun = self._anew = False
         self._held = np.empty(0, SAMPLE)
@@ -225,9 +220,7 @@ class SequenceTracker:
             count = 0 if broken or self._anew else self._in_order(samples)
             if count:
                 yield self._accept(samples[:count], self._counter + 1, False)
-            elif len(samples) == 1 and (
-                self._counter_jumps(samples[0]) or self._missed(samples).any()
-            ):
+            elif len(samples) == 1 and self._counter_jumps(samples[0]):
                 self._held = samples.copy()
                 return
             else:
@@ -251,21 +244,7 @@ class SequenceTracker:
             # A time that falls back while the counter goes on is a spoilt time.
             restarts = samples["counter"] == 0 if not self._counting.checked else True
             good &= ~((np.diff(samples["time"], prepend=self._time) < 0) & restarts)
-            good &= self._missed(samples) == 0
         return len(good) if good.all() else int(np.argmin(good))
-
-    def _missed(self, samples: Samples) -> IntArray:
-        """Return the triggers missed before each of ``samples`` (n,), as its time shows.
-
-        If the step after it is not of one trigger, the time is damaged, or the rate another one.
-        """
-        steps = np.diff(samples["time"], prepend=self._time) * NANOSECOND_S
-        triggers = np.rint(steps / self._trigger)
-        even = np.abs(steps / self._trigger - triggers) < _WHOLE_STEP
-        even &= np.append(even[1:] & (triggers[1:] == 1), True)
-        even &= np.diff(samples["counter"], prepend=self._raw) % self._counting.modulus == 1
-        even &= (triggers > 1) & (steps < _MISSED_S)
-        return np.where(even, triggers - 1, 0).astype(np.int64)
 
     def _accept(self, samples: Samples, first: int, restarted: bool) -> CountedRun:
         self._begun, self._anew = True, False
@@ -314,7 +293,6 @@ class SequenceTracker:
             self.duplicates += 1
             self._time += advance
         else:
-            step += int(self._missed(samples[:2])[0])
             self.lost += step - 1
             self.gaps += step > 1
             yield self._accept(alone, self._counter + step, False)

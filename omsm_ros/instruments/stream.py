@@ -83,7 +83,7 @@ class StreamDevice:
         self._settings = settings
         self._now_ns = now_ns
         self._monotonic = monotonic
-        self._tracker = SequenceTracker(counting, settings.sample_period)
+        self._tracker = SequenceTracker(counting)
         self._small_counter = counting.modulus if counting.modulus <= _SMALL_COUNTER else 0
         self._cutter = BlockCutter(settings, channels, counting.period > 0)
         self._identity: dict[str, str] = {}

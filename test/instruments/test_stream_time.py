@@ -124,31 +124,6 @@ def test_another_rate_is_seen_in_large_portions_too() -> None:
     assert "2000 Hz" in device.trouble
 
 
-@pytest.mark.parametrize("together", [1, 7, 100])
-@pytest.mark.parametrize(("passed", "lost"), [(3.0, 2), (3.01, 2), (2.5, 0), (30.4, 0), (101.0, 0)])
-def test_whole_periods_of_time_are_missed_triggers(together: int, passed: float, lost: int) -> None:
-    """A pause of the trigger has any length."""
-    frames = frames_of(np.arange(300))
-    frames["device_time"][100:] += round((passed - 1) * MS)
-    settings = StreamSettings(block_size=10, pause=NEVER)
-    wire = [encode_frames(frames[i : i + together]) for i in range(0, 300, together)]
-    found, device = run(*wire, settings=settings)
-    numbers = np.concatenate([axes.first_sample + np.arange(len(axes)) for axes, _ in found])
-    counts = np.concatenate([np.rint(axes.x * 1e9).astype(int) for axes, _ in found])
-    expected = np.arange(300) + lost * (np.arange(300) >= 100)
-    np.testing.assert_array_equal(numbers, expected)
-    np.testing.assert_array_equal(counts, np.arange(300))
-    assert device.statistics.lost == lost
-
-
-def test_a_damaged_time_is_no_missed_trigger() -> None:
-    frames = frames_of(np.arange(300))
-    frames["device_time"][100] += 2 * MS
-    found, device = run(*(encode_frames(frames[i : i + 1]) for i in range(300)))
-    assert sum(len(axes) for axes, _ in found) == 300
-    assert device.statistics.lost == 0
-
-
 # Connection.
 
 
