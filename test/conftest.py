@@ -1,6 +1,7 @@
 """Fixtures: recordings of the twin that several tests share, made once and never changed.
 
-The order of tests: several processes share the test files, and files with nodes mostly wait.
+The order of tests: several processes share the test files, and files with nodes mostly wait. The
+process that hands them out imports this file too, so each fixture imports what it needs.
 """
 
 import gc
@@ -9,13 +10,6 @@ import signal
 import hypothesis
 import numpy as np
 import pytest
-
-from benchmarks.twin_motions import step_test_of
-from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.calibration.certificate import Certificate
-from omsm_ros.twin.cell import blocks_of
-from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
-from omsm_ros.twin.scenario import Scenario, scan_of
 
 
 def pytest_configure():
@@ -58,10 +52,6 @@ def approx(expected, rel=None, abs=None, nan_ok=False):
     return _APPROX(expected, rel=rel, abs=abs, nan_ok=nan_ok)
 
 
-# A spiral of 2 mm radius: 40 s, 40 000 samples. The whole mirror has 254 000.
-SMALL = Scenario(start_radius=2e-3)
-
-
 def pytest_collection_modifyitems(items):
     """Spread the files with nodes evenly among the others; the hour of real time begins first."""
     place, paths = {}, {item.path for item in items}
@@ -86,31 +76,47 @@ def _same_numbers(generators):
 
 
 @pytest.fixture(scope="session")
-def small_scan():
-    return scan_of(SMALL)
+def small_scenario():
+    """A spiral of 2 mm radius: 40 s, 40 000 samples. The whole mirror has 254 000."""
+    from omsm_ros.twin.scenario import Scenario
+
+    return Scenario(start_radius=2e-3)
+
+
+@pytest.fixture(scope="session")
+def small_scan(small_scenario):
+    from omsm_ros.twin.scenario import scan_of
+
+    return scan_of(small_scenario)
 
 
 @pytest.fixture(scope="session")
 def small_scan_blocks(small_scan):
+    from omsm_ros.twin.cell import blocks_of
+
     return blocks_of(small_scan)
 
 
 @pytest.fixture(scope="session")
-def step_test():
-    return step_test_of(SMALL)
+def step_test(small_scenario):
+    from benchmarks.twin_motions import step_test_of
+
+    return step_test_of(small_scenario)
 
 
 @pytest.fixture(scope="session")
-def true_calibration():
+def true_calibration(small_scenario):
     """The calibration that an identification without noise would give."""
-    import numpy as np
+    from omsm_ros.core.calibration.calibration import Calibration
+    from omsm_ros.core.calibration.certificate import Certificate
+    from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
     dynamics = Plant().dynamics
     p = len(dynamics.numerator) + len(dynamics.denominator)
     return Calibration(
         dynamics=dynamics,
         static_gain=PAPER_STATIC_GAIN,
-        sample_period=SMALL.sample_period,
+        sample_period=small_scenario.sample_period,
         valid_up_to=100.0,
         covariance=np.zeros((p, p)),
         settings={"machine": "twin"},
