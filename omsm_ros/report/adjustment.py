@@ -95,7 +95,9 @@ def source_table(facts: Mapping[str, Any]) -> Table:
     shown = [s for s in facts["sources"] if s["declared"] is not None or s["refuted"]]
     shown.sort(key=lambda s: -(s["effect"] or 0.0))
     heads = ("declared (k = 1)", "found (k = 1)", "effect on the heights, rms (k = 1)", "")
-    return Table("", heads, [(s["text"], _declared(s), *_found(s), _status(s)) for s in shown])
+    refuted = [s["refuted"] * ("refuted", "significant")[s["declared"] is None] for s in shown]
+    rows = zip(shown, refuted, strict=True)
+    return Table("", heads, [(s["text"], _declared(s), *_found(s), said) for s, said in rows])
 
 
 def tested_text(facts: Mapping[str, Any]) -> str:
@@ -122,10 +124,6 @@ def _found(source: Mapping[str, Any]) -> tuple[str, str]:
         measured(size, spread, "" if source["unit"] == "1" else source["unit"]),
         measured(source["effect"], source["effect_uncertainty"], "m"),
     )
-
-
-def _status(source: Mapping[str, Any]) -> str:
-    return ("significant" if source["declared"] is None else "refuted") * source["refuted"]
 
 
 def _scans(facts: Mapping[str, Any]) -> Table:

@@ -10,10 +10,10 @@ from itertools import pairwise
 import numpy as np
 import scipy  # whose parts are loaded when they are used
 
-from omsm_ros.core.adjustment.families import REPEATED_TRACK, only
+from omsm_ros.core.adjustment.families import REPEATED_TRACK, only, periodic
 from omsm_ros.core.adjustment.network import Solution
 from omsm_ros.core.adjustment.scan_data import ScanView
-from omsm_ros.core.adjustment.sources import VIBRATION, Columns, Family
+from omsm_ros.core.adjustment.sources import VIBRATION, Family
 from omsm_ros.core.registration.form_model import outlier_limit
 from omsm_ros.core.registration.isolated_points import ISOLATED, FarPoints
 from omsm_ros.core.registration.placement import Placed
@@ -94,7 +94,7 @@ def lines_of(solution: Solution, view: ScanView) -> list[Family]:
             break
         _, series = _without(series, 2 * np.pi * refined * period)
         name = f"{VIBRATION}/{refined:.4g}@{view.index}"
-        wave = only(view.index, 2, _wave(2 * np.pi * refined))
+        wave = only(view.index, 2, periodic("since", 1 / refined))
         found.append(Family(name, "m", 2, wave, 1e-7, REPEATED_TRACK))
     return found
 
@@ -134,10 +134,6 @@ def _floor(power: FloatArray) -> FloatArray:
     level = [float(np.median(power[a:b])) for a, b in pairwise(edges)]
     middle = (edges[:-1] + edges[1:]) / 2
     return np.asarray(np.interp(np.arange(len(power)), middle, level) / np.log(2.0))
-
-
-def _wave(turned: float) -> Columns:
-    return lambda v: np.stack([np.cos(turned * v.since), np.sin(turned * v.since)])
 
 
 def steps_of(solution: Solution, scan: int) -> list[Family]:

@@ -281,7 +281,7 @@ def _of_the_probe(r: Ranges) -> list[Family]:
     fast, end = r.motion * r.speed, r.half_range
     places = {"encoder_interpolation": "motion", "probe_periodic": "distance"}
     return [
-        *(Family(name, "m", 2, _periodic(places[name], period), 1e-7, OTHER_STAND_OFF)
+        *(Family(name, "m", 2, periodic(places[name], period), 1e-7, OTHER_STAND_OFF)
           for name, period in r.periods.items() if name in places),
         Family("probe_slope", "m/rad", 2, lambda v: np.stack(
             [v.across(-1.0, 0.0), v.across(0.0, -1.0)]), 2e-7, REFERENCE),
@@ -301,7 +301,8 @@ def _of_the_probe(r: Ranges) -> list[Family]:
     ]  # fmt: skip
 
 
-def _periodic(place: str, period: float) -> Columns:
+def periodic(place: str, period: float) -> Columns:
+    """Return the waves of ``period`` of a field of the points; period: in its unit."""
     return lambda v: np.stack(_waves(getattr(v, place), 2 * np.pi / period))
 
 

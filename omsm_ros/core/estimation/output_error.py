@@ -127,10 +127,6 @@ class Problem:
         """Samples of one period."""
         return len(close_period(self.input, self.period))
 
-    def closed_spectrum(self, values: FloatArray) -> ComplexArray:
-        """Transform of ``values`` (n,), closed to a period, at ``s``, shape (k,)."""
-        return np.asarray(fft.rfft(close_period(values, self.period)))[: len(self.s)]
-
     @cached_property
     def _spectrum(self) -> ComplexArray:
         closed = np.asarray(fft.rfft(close_period(self.input, self.period)), np.complex128)
@@ -161,7 +157,8 @@ class Problem:
 
     @cached_property
     def _further(self) -> list[ComplexArray]:
-        return [self.closed_spectrum(motion) for motion in self.further]
+        closed = (close_period(motion, self.period) for motion in self.further)
+        return [np.asarray(fft.rfft(motion))[: len(self.s)] for motion in closed]
 
     @cached_property
     def _pulses(self) -> list[ComplexArray]:

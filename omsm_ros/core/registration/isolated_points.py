@@ -41,8 +41,6 @@ _SHARE_AROUND = 0.05
 _AT_A_TIME = 4096
 # Least number of such points where larger ones are judged by it.
 _FEW = 2.0
-# The density of dust near a cluster is counted within this many reaches.
-_NEARBY = 5.0
 # Expected number of clusters by chance that are mistaken for form, in a whole measurement.
 _BY_CHANCE = 0.01
 # Standard deviations of a number that chance does not exceed.
@@ -60,17 +58,19 @@ class FarPoints:
     """Collects the points beyond the outlier limit, and the length of the path of all points.
 
     limit: of the residual, beyond which a point is far [m]
-    rows, near: index in the order of reading, x, y, residual and step to the next point, of the far
-        points, and of those beyond half the limit, portions of (5, k)
+    rows, near: index in the order of reading, x, y, residual, step to the next point, and whether a
+        line ends there, of the far points, and of those beyond half the limit, portions of (6, k)
     read, points: number of points so far, and of those with a deviation;  path: [m]
+    ends: number of points where a line begins or ends
     """
 
     limit: float
-    rows: list[FloatArray] = field(default_factory=lambda: [np.empty((5, 0))])
-    near: list[FloatArray] = field(default_factory=lambda: [np.empty((5, 0))])
+    rows: list[FloatArray] = field(default_factory=lambda: [np.empty((6, 0))])
+    near: list[FloatArray] = field(default_factory=lambda: [np.empty((6, 0))])
     read: int = 0
     points: int = 0
     path: float = 0.0
+    ends: int = 0
     low: FloatArray = field(default_factory=lambda: np.full(2, np.inf))
     high: FloatArray = field(default_factory=lambda: np.full(2, -np.inf))
 
@@ -83,7 +83,13 @@ class FarPoints:
         self.read += len(good)
         if not len(steps):
             return np.zeros(len(far), bool)
-        columns = (index, points.x, points.y, residual, np.append(steps, steps[-1]))
+        # The step to another line is longer than those before and after it.
+        turn = np.zeros(len(steps) + 2, bool)
+        turn[2:-2] = steps[1:-1] > _REACH * np.maximum(steps[:-2], steps[2:])
+        turn[[0, -1]] = True
+        end = turn[1:] | turn[:-1]
+        self.ends += int(end.sum())
+        columns = (index, points.x, points.y, residual, np.append(steps, steps[-1]), end)
         for kept, at in ((self.rows, far), (self.near, ~far & (size > self.limit / 2))):
             kept.append(np.stack([values[at] for values in columns]))
         self.points += len(residual)
@@ -109,21 +115,32 @@ class FarPoints:
                 form = _confirmed(event, grain, rows, space, self.points)
                 for begin in range(0, len(form), _AT_A_TIME):
                     open_ = begin + np.flatnonzero(~form[begin : begin + _AT_A_TIME])
-                    form[open_] |= self._like_surroundings(open_, form, event, rows, space)
-                form = self._without_spikes(form, rows, space)
+                    form[open_] |= self._like_surroundings(open_, event, rows, space)
+                form = self._without_spikes(form | self._at_ends(form, event, rows), rows, space)
             else:
                 cluster, _ = _clusters(event, rows, space.reach, _SIMILAR)
                 form = np.bincount(cluster)[cluster] > int(rule)
         return index[~form], form
 
+    def _at_ends(self, form: BoolArray, event: IntArray, rows: FloatArray) -> BoolArray:
+        """Return which far points (k,) are of events at ends of lines, more than dust has there.
+
+        The form rolls off between the last points of lines, which no other point confirms.
+        """
+        from scipy.special import bdtrc
+
+        single = np.unique(event[~form])
+        at_end = np.intersect1d(single, event[rows[5] > 0])
+        chance = bdtrc(len(at_end) - 1.0, len(single), self.ends / self.points)
+        return np.isin(event, at_end) & bool(chance < _BY_CHANCE)
+
     def _like_surroundings(
-        self, at: IntArray, form: BoolArray, event: IntArray, rows: FloatArray, space: _Space
+        self, at: IntArray, event: IntArray, rows: FloatArray, space: _Space
     ) -> BoolArray:
         """Return which far points ``at`` (m,) are like a good share of the points around.
 
         A slope of the form crosses the limit between two points, and a pip in the centre of a
-        spiral is crossed by few turns. Points of the same event do not count; two of other events
-        that are ``form`` (k,) are enough.
+        spiral is crossed by few turns. Points of the same event do not count.
         """
         from scipy.spatial import cKDTree
 
@@ -135,17 +152,13 @@ class FarPoints:
             cKDTree(others[1:3].T), space.reach, output_type="coo_matrix"
         )
         ratio = others[3][pairs.col] / rows[3][at][pairs.row]
-        little = np.abs(rows[3][at]) <= 2 * self.limit
-        known = np.append(form, np.zeros(others.shape[1] - len(form), bool))[pairs.col]
-        # A larger one is no slope of the form if it is dust itself.
-        like = (ratio > 1 / _SIMILAR) & ((ratio < _SIMILAR) | (little[pairs.row] & known))
-        like &= events[pairs.col] != event[at][pairs.row]
-        count, company = (np.bincount(pairs.row[v], None, len(at)) for v in (like, like & known))
+        like = (ratio > 1 / _SIMILAR) & (events[pairs.col] != event[at][pairs.row])
+        count = np.bincount(pairs.row[like], None, len(at))
         # Where few points are around, dust too has company; only clusters tell.
         around = space.around(rows[4][at])
-        decided = little | (around >= _FEW / _SHARE_AROUND)
+        decided = (np.abs(rows[3][at]) <= 2 * self.limit) | (around >= _FEW / _SHARE_AROUND)
         enough = count >= np.maximum(_SHARE_AROUND * around, 1.0 if space.line else _FEW)
-        return np.asarray((decided & enough) | (company >= _FEW))
+        return np.asarray(decided & enough)
 
     def _without_spikes(self, form: BoolArray, rows: FloatArray, space: _Space) -> BoolArray:
         """Return which far points (k,) are ``form`` or lie about it, and are no dust on it.
@@ -166,8 +179,9 @@ class FarPoints:
         expected = float(np.sum(~about)) * around / self.points
         most, rare = int(expected + _CHANCE * np.sqrt(expected)), _BY_CHANCE / max(expected, 1.0)
         steep, size, tree = np.where(form, 0.0, np.abs(rows[3])), others[3], cKDTree(others[1:3].T)
-        open_ = np.flatnonzero(form)
+        open_, track = np.flatnonzero(form), np.zeros(self.read + 2)
         while True:
+            track[others[0].astype(np.int64)] = size
             for begin in range(0, len(open_), _AT_A_TIME):
                 part = open_[begin : begin + _AT_A_TIME]
                 places = rows[1:3, part].T
@@ -182,6 +196,11 @@ class FarPoints:
                 full, height = there[:, -1], np.abs(rows[3, part])
                 level = np.where(full, ranked[:, -_AROUND // 4], _SIMILAR / _DENSE * level)
                 alone = (height - level > self.limit) & (height > _DENSE * level)
+                # A grain has no foot of several points: what goes on as its track rises is form.
+                at = rows[0, part].astype(np.int64) + np.array([[2], [-2], [1], [-1]])
+                foot = np.maximum(track[at] * np.sign(rows[3, part]), 1e-30).reshape(2, 2, -1)
+                rise = foot[1] * np.minimum(foot[1] / foot[0], _SIMILAR)
+                alone &= height - np.max(rise, axis=0) > self.limit
                 steep[part] = np.where(alone, height - level, 0.0)
                 about[part[alone & full]] = False
             steep[~about] = 0.0
@@ -224,18 +243,15 @@ class _Space:
         along = 2 * self.reach / np.maximum(step, 1e-3 * self.spacing)
         return np.asarray(along if self.line else along * 2 * self.reach / self.spacing)
 
-    def larger(self, factor: float) -> float:
-        """Return how much more space a ``factor`` of the reach covers."""
-        return factor if self.line else factor**2
-
 
 def _events(rows: FloatArray, reach: float, similar: float) -> IntArray:
     """Return the event (k,) of each far point: successive ones that are ``similar``.
 
-    rows: index, x, y, residual and step of the far points (5, k)
+    rows: index, x, y, residual, step and end of line of the far points (6, k)
     """
     # Steps along a track may be longer than the distance of the tracks.
     apart = np.hypot(*np.diff(rows[1:3])) > np.maximum(reach, _REACH * rows[4, :-1])
+    apart |= rows[5, :-1] * rows[5, 1:] > 0
     ratio = rows[3, 1:] / rows[3, :-1]
     new = (np.diff(rows[0]) > _GAP) | apart | (ratio < 1 / similar) | (ratio > similar)
     return np.concatenate([[0], np.cumsum(new)])
@@ -284,7 +300,8 @@ def _confirmed(
     """
     form = np.zeros(len(event), bool)
     for factor, similar in _SCALES:
-        wide = replace(space, reach=factor * space.reach, share=space.larger(factor) * space.share)
+        larger = factor if space.line else factor**2
+        wide = replace(space, reach=factor * space.reach, share=larger * space.share)
         widest = factor == _SCALES[-1][0]
         one = grain if widest or similar == np.inf else event
         begins = np.concatenate([[0], np.flatnonzero(np.diff(one)) + 1])
@@ -315,23 +332,18 @@ def _no_chance(
     Where each event has μ neighbours on average, clusters of k have Borel's distribution at most,
     e^(−μk) (μk)^(k−1) / k!, because links that meet again add none (M. Penrose, Random Geometric
     Graphs, 2003).
-    The expected number of similar events around one follows from the single events, in all and
-    nearby, because a spiral has more points, and so more dust, about its centre.
+    The expected number of similar events around one follows from the single events, and from the
+    points around: a spiral has more of them, and so more dust, about its centre.
 
-    cluster: of each event (m,);  rows: of its first point (5, m)
+    cluster: of each event (m,);  rows: of its first point (6, m)
     similar: share of pairs of events that are similar by chance
     """
-    from scipy.spatial import cKDTree
     from scipy.special import gammaln
 
-    sizes, places = np.bincount(cluster), rows[1:3].T
-    single = sizes[cluster] == 1
-    trees = cKDTree(places), cKDTree(places[single])
-    some = np.asarray(trees[1].query_ball_point(places, _NEARBY * space.reach, return_length=True))
-    nearby = (np.maximum(some - single, 0) + 1.0) / space.larger(_NEARBY)
-    total = float(np.sum(single))
+    sizes = np.bincount(cluster)
+    total = float(np.sum(sizes == 1))
     dense = total * np.maximum(space.around(rows[4]) / points, space.share)
-    chance = np.bincount(cluster, np.maximum(nearby, dense)) / sizes
+    chance = np.bincount(cluster, dense) / sizes
     # An event of dust is single with the probability e^(−μ).
     chance = chance * similar * np.exp(np.minimum(chance * similar, 1.0))
     chance = np.clip(chance, np.finfo(np.float64).tiny, 1.0)

@@ -137,6 +137,26 @@ def test_a_rolled_edge_stays_where_steps_are_longer_than_the_tracks_are_apart():
     assert len(found.dust) < 5
 
 
+@pytest.mark.parametrize(("share", "width"), [(0, 0.6), (1e-3, 1.0)])
+def test_an_edge_that_rolls_off_between_the_last_points_of_lines_stays(share, width):
+    """On a raster of 90 lines; width: of the cubic roll-off in distances of the lines."""
+    rng = np.random.default_rng(3)
+    lines, steps = np.linspace(-9e-3, 9e-3, 90), np.arange(-12e-3, 12e-3, 80e-6)
+    x, y = np.meshgrid(steps, lines)
+    x[1::2] = x[1::2, ::-1]
+    x = x + rng.uniform(0, 80e-6, (90, 1))
+    rim = np.hypot(x / 12e-3, y / 9e-3)
+    x, y, rim = x[rim <= 1], y[rim <= 1], rim[rim <= 1]
+    height = -80e-9 * np.clip(1 - (1 - rim) * 12e-3 / (width * 202e-6), 0, None) ** 3
+    dusty = rng.random(len(x)) < share
+    height += rng.normal(0, 2e-9, len(x)) + rng.lognormal(np.log(1e-6), 1, len(x)) * dusty
+    batch = PointBatch(x, y, height, np.empty((0, len(x))))
+    found = register(Flat(), lambda: [batch], ("piston", "tip", "tilt"))
+    assert np.sum(height < -30e-9) > 30
+    assert len(np.setdiff1d(found.dust, np.flatnonzero(dusty))) <= 2
+    assert np.all(np.abs(height[np.setdiff1d(np.flatnonzero(dusty), found.dust)]) < 4 * found.limit)
+
+
 def sparse(heights):
     """Register a spiral with steps of twice the distance of its 100 tracks, noise of 3 nm."""
     r, c = np.linspace(R, 0, 12_000), np.linspace(0, 200 * np.pi, 12_000)
