@@ -95,8 +95,8 @@ def source_table(facts: Mapping[str, Any]) -> Table:
     shown = [s for s in facts["sources"] if s["declared"] is not None or s["refuted"]]
     shown.sort(key=lambda s: -(s["effect"] or 0.0))
     heads = ("declared (k = 1)", "found (k = 1)", "effect on the heights, rms (k = 1)", "")
-    refuted = [s["refuted"] * ("refuted", "significant")[s["declared"] is None] for s in shown]
-    rows = zip(shown, refuted, strict=True)
+    status = ["significant" if s["declared"] is None else "refuted" * s["refuted"] for s in shown]
+    rows = zip(shown, status, strict=True)
     return Table("", heads, [(s["text"], _declared(s), *_found(s), said) for s, said in rows])
 
 

@@ -301,16 +301,16 @@ def _confirmed(
     form = np.zeros(len(event), bool)
     for factor, similar in _SCALES:
         larger = factor if space.line else factor**2
-        wide = replace(space, reach=factor * space.reach, share=larger * space.share)
+        farther = replace(space, reach=factor * space.reach, share=larger * space.share)
         widest = factor == _SCALES[-1][0]
         one = grain if widest or similar == np.inf else event
         begins = np.concatenate([[0], np.flatnonzero(np.diff(one)) + 1])
-        cluster, alike = _clusters(one, rows, wide.reach, similar)
+        cluster, alike = _clusters(one, rows, farther.reach, similar)
         # Dust that often meets by chance makes clusters, and no single event shows its density.
         open_ = np.count_nonzero(~form[begins])
-        if factor > 1 and open_ * wide.share * alike > _MOST_MEETING:
+        if factor > 1 and open_ * farther.share * alike > _MOST_MEETING:
             continue
-        form |= _no_chance(cluster[begins], rows[:, begins], wide, points, alike)[cluster]
+        form |= _no_chance(cluster[begins], rows[:, begins], farther, points, alike)[cluster]
     # A point of the smooth form between far points shows that they are several grains.
     parted = (np.diff(event) != 0) | (np.diff(rows[0]) > 1)
     run = np.concatenate([[0], np.cumsum(parted)])
