@@ -33,8 +33,6 @@ _RIM = 96
 _LAST_TURNS = 1.5
 # Draws: a standard deviation to 4 %.
 _DRAWS = 300
-# A smaller probability lies outside an interval of 95 %.
-_LEAST_LIKELY = 0.05
 # Two turns may both lie a quarter of the width of a ring off its middle.
 _OFF_MIDDLE = 0.3
 # Shares of a cell at which its two Gaussian nodes are.
@@ -486,5 +484,4 @@ def _resembled(
         gain, values = form.looks_like(fit @ shape, known)
         found.append((family.name, gain, shape @ values))
     probable = probabilities([gain for _, gain, _ in found])
-    return [(found[k][0], np.sqrt(probable[k]) * found[k][2])
-            for k in np.argsort(-probable) if probable[k] > _LEAST_LIKELY]  # fmt: skip
+    return [(found[k][0], np.sqrt(probable[k]) * found[k][2]) for k in np.argsort(-probable)]

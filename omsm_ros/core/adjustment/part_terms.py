@@ -147,8 +147,6 @@ def part_model(blocks: Blocks, turns: float, highest: int = HIGHEST_DEGREE) -> P
 START_POWER = 3.0
 # Sizes that are compared, over the plausible one; each is as probable.
 _SIZES = 10.0 ** np.arange(-1.5, 1.1, 0.5)
-# Relative to a log likelihood of some hundreds, which matters from 0.5 on.
-_TOLERANCE = {"ftol": 1e-5}
 # Share of the largest variance: twenty times what a factorisation of fifty rows loses.
 _ROUNDING = 1e-13
 
@@ -200,11 +198,13 @@ class FormTerms:
         share, axes = np.linalg.eigh(self.covariance + columns @ columns.T)
         # A small scan leaves terms of which only the rounding is known, of either sign.
         known = axes * np.maximum(share, _ROUNDING * share[-1]) @ axes.T
-        start = np.log(np.mean(self.values**2 * self.degrees**START_POWER) + 1e-30)
+        # About the middle degree: amplitude and power are found apart, not along a narrow valley.
+        degrees = self.degrees / np.exp(np.mean(np.log(self.degrees)))
+        start = np.log(np.mean(self.values**2 * degrees**START_POWER) + 1e-30)
 
         def own(law: FloatArray) -> FloatArray:
             amplitude = np.exp(np.where(self.symmetric, law[1], law[0]))
-            return np.asarray(amplitude * self.degrees ** -law[2])
+            return np.asarray(amplitude * degrees ** -law[2])
 
         def misfit(law: FloatArray) -> tuple[float, FloatArray]:
             # Asked for ten thousand times: what checks the matrices would take most of it.
@@ -214,12 +214,12 @@ class FormTerms:
             inverse, _ = scipy.linalg.lapack.dpotri(root, lower=1)
             slopes = variances * (inverse.diagonal() - pulled**2) / 2
             rises = self.symmetric @ slopes
-            slope = [slopes.sum() - rises, rises, -slopes @ np.log(self.degrees)]
+            slope = [slopes.sum() - rises, rises, -slopes @ np.log(degrees)]
             value = np.log(root.diagonal()).sum() + self.values @ pulled / 2
             return float(value), np.array(slope)
 
         # The law of terms that are zero has no end: 50 is twenty orders of magnitude.
         bounds = [(start - 50, start + 50)] * 2 + [(0.0, 4 * START_POWER)]
         best = scipy.optimize.minimize(misfit, [start, start, START_POWER], method="L-BFGS-B",
-                                 jac=True, bounds=bounds, options=_TOLERANCE)  # fmt: skip
+                                       jac=True, bounds=bounds)  # fmt: skip
         return -float(best.fun), known + np.diag(own(best.x))
