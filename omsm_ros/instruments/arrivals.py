@@ -293,16 +293,20 @@ class _Phases:
         self._means: deque[tuple[complex, ...]] = deque(maxlen=_LATEST)  # [s], 1/n, harmonics
         self._in_step = self._polled = self._uneven = self.ages = False
 
-    def add(self, due: float, arrival: float) -> None:
-        """Enter an arrival;  due: count times period [s]."""
+    def add(self, due: float, arrival: float, excess: float) -> None:
+        """Enter an arrival;  due: count times period [s];  excess: lateness over the earliest [s].
+
+        A delayed one may be a part of a backlog, so its count is that of no poll.
+        """
         sample, late = round(due / self._period), (arrival - due) / self._period
-        self._block = math.gcd(self._block, sample - self.last) if self._steps else 0
-        if self._block == 1:
-            lasted = arrival - self._since > self._period / LARGEST_CRYSTAL_DRIFT
-            self._polled |= lasted and self._steps > _CERTAIN / math.log(2)
-            self._steps, self._uneven = 0, True
-        self._since = self._since if self._steps else arrival
-        self._steps, self.last = self._steps + 1, sample
+        if excess < _EARLY_PERIODS * self._period:
+            self._block = math.gcd(self._block, sample - self.last) if self._steps else 0
+            if self._block == 1:
+                lasted = arrival - self._since > self._period / LARGEST_CRYSTAL_DRIFT
+                self._polled |= lasted and self._steps > _CERTAIN / math.log(2)
+                self._steps, self._uneven = 0, True
+            self._since = self._since if self._steps else arrival
+            self._steps, self.last = self._steps + 1, sample
         if arrival - self._begin >= SPAN_S:
             if self._lates:
                 self._end_span(np.array(self._lates))
@@ -347,7 +351,7 @@ class _Reference:
     def confirms(self, due: float, arrival: float, motion: SteadyMotion) -> bool:
         """Return whether no trigger was missed before this arrival, as far as can be seen."""
         late = arrival - due
-        self._phases.add(due, arrival)
+        self._phases.add(due, arrival, self.excess(due, arrival))
         width = _FIRST_S if not self.proven and len(self._earliest) < _FIRST_SPANS else SPAN_S
         before, least = self._earliest[-1] if self._earliest else (-math.inf, 0.0)
         goes_on = arrival - before < width

@@ -40,7 +40,6 @@ class DeviceReader:
         deliver: Callable[[Sequence[BlockPair]], None],
         note: Callable[[str], None] = lambda _: None,
         complain: Callable[[str], None] = lambda _: None,
-        back_off: tuple[float, float] = BACK_OFF_S,
         connected: Callable[[], None] = lambda: None,
     ) -> None:
         """device: as ``StreamDevice``
@@ -53,7 +52,6 @@ class DeviceReader:
         self._device = device
         self._deliver = deliver
         self._note, self._warn = note, complain
-        self._back_off = back_off
         self._when_connected = connected
         self._unproven = False
         self._requests: queue.SimpleQueue[tuple[Callable[[], Any], futures.Future[Any]]] = (
@@ -89,13 +87,13 @@ class DeviceReader:
 
     def run(self, stop: threading.Event) -> None:
         """Read until ``stop``."""
-        least = pause = self._back_off[0]
+        least = pause = BACK_OFF_S[0]
         while not stop.is_set():
             began = time.monotonic()
             if self._read_once(stop):
                 pause = least
             stop.wait(max(began + pause - time.monotonic(), least))
-            pause = min(2 * pause, self._back_off[1])
+            pause = min(2 * pause, BACK_OFF_S[1])
         self.state = State.ENDED
 
     def _read_once(self, stop: threading.Event) -> bool:

@@ -112,6 +112,29 @@ def test_blocks_that_are_sent_at_once_show_how_many_were_missed(size: int, misse
     assert resumed < 7.0
 
 
+def test_a_backlog_that_is_read_in_other_portions_does_not_make_blocks_polls() -> None:
+    """The host stood still for 0.6 s; the sender looks for whole blocks every 2 ms."""
+    size, period, stop, end = 20, 2e-4, 3.0, 3.6
+    random, detector = np.random.default_rng(4), MissedTriggerDetector(period, 0.2, wraps=[0])
+    looks = np.cumsum(2.1e-3 + random.exponential(3e-4, 2800))
+    counts, first = np.unique(np.floor(looks / (size * period)) * size, return_index=True)
+    sent = [*zip(looks[first].tolist(), counts.astype(int).tolist(), strict=True)]
+    backlog = [(end, 15_700), (end, 16_433), (end, 17_166), (end + 5e-3, 17_993)]
+    arrivals = [
+        *(x for x in sent if x[0] < stop),
+        *backlog,
+        *(x for x in sent if x[0] > end + 0.01),
+    ]
+    confirmed, before = [0.0], 0
+    for at, count in arrivals:
+        silent = at == backlog[0][0]
+        detector.motion.follow(np.arange(before, count)[:, np.newaxis] * 5000, linked=not silent)
+        if detector.confirms(count * period, UPTIME_S + at, after_silence=silent):
+            confirmed.append(at)
+        before = count
+    assert np.max(np.diff(confirmed, append=arrivals[-1][0])) < 1.0
+
+
 def test_a_missed_trigger_is_seen_on_a_grid_of_half_a_period() -> None:
     """A USB frame of 1 ms becomes early enough for the age of a 500 Hz trigger when one is missed.
 

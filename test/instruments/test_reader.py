@@ -121,10 +121,11 @@ def test_a_device_that_comes_back_at_any_time_is_connected_within_half_a_second(
     assert max(waited) <= 0.5
 
 
-def test_a_stop_ends_a_long_pause_at_once() -> None:
+def test_a_stop_ends_a_long_pause_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("omsm_ros.instruments.reader.BACK_OFF_S", (1e6, 1e6))
     stop = threading.Event()
     device = Scripted(threading.Event(), [DeviceError("gone")] * 5, [[]])
-    reader = DeviceReader(device, lambda _: None, back_off=(1e6, 1e6))
+    reader = DeviceReader(device, lambda _: None)
     thread = threading.Thread(target=reader.run, args=(stop,))
     thread.start()
     stop.set()
@@ -132,7 +133,10 @@ def test_a_stop_ends_a_long_pause_at_once() -> None:
     assert not thread.is_alive()
 
 
-def test_a_defect_while_the_device_is_let_go_does_not_end_the_reading() -> None:
+def test_a_defect_while_the_device_is_let_go_does_not_end_the_reading(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("omsm_ros.instruments.reader.BACK_OFF_S", (1e-3, 4e-3))
     stop = threading.Event()
 
     class Stubborn(Scripted):
@@ -142,7 +146,7 @@ def test_a_defect_while_the_device_is_let_go_does_not_end_the_reading() -> None:
 
     device = Stubborn(stop, [[], []], [DeviceError("pulled"), [BLOCK]])
     got: list[BlockPair] = []
-    reader = DeviceReader(device, got.extend, lambda _: None, back_off=(1e-3, 4e-3))
+    reader = DeviceReader(device, got.extend, lambda _: None)
     reader.run(stop)
     assert (device.closed, got, reader.connections) == (2, [BLOCK], 2)
 

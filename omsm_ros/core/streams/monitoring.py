@@ -15,22 +15,21 @@ WINDOW_S = 10.0
 
 
 class RecentIncrease:
-    """Increase of counts within the last ``window`` [s].
+    """Increase of counts within the last ``WINDOW_S``.
 
     At the first update all that was counted before is new.
     """
 
-    def __init__(self, window: float = WINDOW_S) -> None:
-        self._window = window
+    def __init__(self) -> None:
         self._looks: deque[tuple[float, dict[str, float]]] = deque()
 
     def update(self, counts: Mapping[str, float], now: float) -> dict[str, float]:
         """Return name → increase of the counts that rose; one that fell was reset to zero."""
         self._looks.append((now, dict(counts)))
-        while len(self._looks) > 1 and self._looks[1][0] <= now - self._window:
+        while len(self._looks) > 1 and self._looks[1][0] <= now - WINDOW_S:
             self._looks.popleft()
         since, before = self._looks[0]
-        base = before if since <= now - self._window else {}
+        base = before if since <= now - WINDOW_S else {}
         rises = {
             name: value - earlier if value >= (earlier := base.get(name, 0)) else value
             for name, value in counts.items()
@@ -39,10 +38,9 @@ class RecentIncrease:
 
 
 class SampleFlow:
-    """Sample rate of a stream over ``window`` [s], and the time since its last sample."""
+    """Sample rate of a stream over ``WINDOW_S``, and the time since its last sample."""
 
-    def __init__(self, window: float = WINDOW_S) -> None:
-        self._window = window
+    def __init__(self) -> None:
         self._looks: deque[tuple[float, int]] = deque()
         self._last: float | None = None
 
@@ -51,7 +49,7 @@ class SampleFlow:
         if samples > (self._looks[-1][1] if self._looks else 0):
             self._last = now
         self._looks.append((now, samples))
-        while len(self._looks) > 2 and self._looks[1][0] <= now - self._window:
+        while len(self._looks) > 2 and self._looks[1][0] <= now - WINDOW_S:
             self._looks.popleft()
 
     def silent(self, now: float) -> float | None:

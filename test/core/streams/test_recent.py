@@ -8,7 +8,7 @@ from omsm_ros.core.streams.monitoring import RecentIncrease, SampleFlow
 
 
 def test_a_fault_is_recent_for_the_window_and_history_after() -> None:
-    recent = RecentIncrease(window=10.0)
+    recent = RecentIncrease()
     assert recent.update({"lost": 0}, 0.0) == {}
     assert recent.update({"lost": 3}, 5.0) == {"lost": 3}
     assert recent.update({"lost": 5}, 12.0) == {"lost": 5}
@@ -18,26 +18,26 @@ def test_a_fault_is_recent_for_the_window_and_history_after() -> None:
 
 
 def test_what_was_counted_before_the_first_look_is_new_then() -> None:
-    recent = RecentIncrease(window=10.0)
+    recent = RecentIncrease()
     assert recent.update({"lost": 7}, 100.0) == {"lost": 7}
     assert recent.update({"lost": 7}, 110.5) == {}
 
 
 def test_a_count_that_began_anew_counts_from_zero() -> None:
-    recent = RecentIncrease(window=10.0)
+    recent = RecentIncrease()
     recent.update({"lost": 100}, 0.0)
     recent.update({"lost": 100}, 10.0)
     assert recent.update({"lost": 4}, 11.0) == {"lost": 4}
 
 
 def test_names_are_distinguished() -> None:
-    recent = RecentIncrease(window=10.0)
+    recent = RecentIncrease()
     recent.update({"a": 0, "b": 0}, 0.0)
     assert recent.update({"a": 1, "b": 0}, 1.0) == {"a": 1}
 
 
 def test_a_flow_that_never_began_is_not_one_that_ended() -> None:
-    flow = SampleFlow(window=10.0)
+    flow = SampleFlow()
     flow.update(0, 0.0)
     flow.update(0, 50.0)
     assert flow.silent(50.0) is None
@@ -45,7 +45,7 @@ def test_a_flow_that_never_began_is_not_one_that_ended() -> None:
 
 
 def test_silence_counts_from_the_last_look_that_saw_samples() -> None:
-    flow = SampleFlow(window=10.0)
+    flow = SampleFlow()
     for second in range(5):
         flow.update(1000 * second, float(second))
     assert flow.silent(4.0) == 0
@@ -54,7 +54,7 @@ def test_silence_counts_from_the_last_look_that_saw_samples() -> None:
 
 
 def test_the_rate_is_that_of_the_window() -> None:
-    flow = SampleFlow(window=10.0)
+    flow = SampleFlow()
     for second in range(20):
         flow.update(1000 * second, float(second))
     assert flow.rate == pytest.approx(1000.0)
