@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omsm_ros.core.form import texture
 from omsm_ros.core.form.deviation_map import (
@@ -45,6 +46,8 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.streams.statistics import EvenSelection, noise_of
 from omsm_ros.core.surface.aperture import Aperture, best_covered, within_aperture
 from omsm_ros.core.surface.area_weights import LINE_WIDTH, area_weights
+from omsm_ros.core.surface.height_grid import as_grid
+from omsm_ros.core.surface.measured_points import measured
 from omsm_ros.core.surface.zernike_terms import (
     ZernikeIndex,
     first_terms,
@@ -203,7 +206,7 @@ def analyse_form(
     surface, aperture = within_aperture(surface, aperture)
     how = {"sources": sources, "aperture": aperture, "even": even, "dust": dust}
     found = register(surface, portions, asked, declared=declared, **how)  # type: ignore[arg-type]
-    gathered = _Gathered(surface, found, aperture)
+    gathered = _Gathered(surface, found, aperture, even)
     for portion in portions():
         for part in portion.chunks(CHUNK):
             gathered.add(part)
@@ -224,7 +227,7 @@ def analyse_form(
     of_rim, guess = None if outline.outline == "annulus" else strip, aperture is None
     gaps = Gaps.of(map_, outline, found.spacing, of_rim, guessed=guess, uncovered=uncovered)
     del strip, of_rim  # it is as large as the map
-    figures, textures = _figures(smooth, zernike, cells, bands, outline, even, gaps)
+    figures, textures = _figures(smooth, zernike, cells, bands, outline, gaps, gathered)
     return FormResult(
         registration=found, aperture=outline, map=map_, zernike=zernike, bands=bands,
         deviation=figures | gathered.as_measured(map_) | textures,
@@ -235,13 +238,14 @@ def analyse_form(
 
 def _figures(
     smooth: SmoothTerms, zernike: ZernikeFit, cells: GridCells, bands: texture.Bands,
-    outline: Aperture, even: bool, gaps: Gaps | None,
+    outline: Aperture, gaps: Gaps | None, gathered: _Gathered,
 ) -> tuple[dict[str, UncertainValue], dict[str, UncertainValue]]:  # fmt: skip
     """Return figures of the map, and its texture with slopes;  cells: of it."""
+    even, missed = gathered.even, gathered.missed
     map_, rest = smooth.map, smooth.without(SECOND_ORDER)
     rest_cells = GridCells.of(rest, even=even)
     maps = [map_, best_fit(map_), rest, smooth.without(POWER)]
-    extents = extents_of_parts(maps, smooth.disc, gaps)
+    extents = extents_of_parts(maps, smooth.disc, gaps, missed)
     sizes = [_rms_to_rim(each, gaps) for each in maps[:3]]
     del maps, rest  # each is as large as the map
     figures = optical_terms(smooth, zernike, gaps) | {
@@ -258,21 +262,25 @@ def _figures(
     if cells.width == 0 or bands.s_filter is not None:
         return figures, texture.texture(cells, formless, bands, None, rest_cells)
     points = short_waves(points, formless, bands.l_filter)
-    textures = texture.texture(cells, formless, bands, points, rest_cells)
+    gradient = gathered.gradient if even else None
+    textures = texture.texture(cells, formless, bands, points, rest_cells, gradient)
     gaps = None if even else gaps
-    whole = extents_of_parts([points], smooth.disc, gaps)[0][0]
+    whole = extents_of_parts([points], smooth.disc, gaps, missed)[0][0]
     return figures, textures | {"Sq": _rms_to_rim(points, gaps), "Sz": whole}
 
 
 class _Gathered:
     """Collects the deviations of points that come in portions."""
 
-    def __init__(self, surface: Surface, found: Registration, aperture: Aperture | None) -> None:
-        self._surface, self._found, self._aperture = surface, found, aperture
+    def __init__(
+        self, surface: Surface, found: Registration, aperture: Aperture | None, even: bool
+    ) -> None:
+        self._surface, self._found, self._aperture, self.even = surface, found, aperture, even
         self._kept = EvenSelection(MOST_WEIGHED)
         self.least, self.most = np.inf, -np.inf
         self._noise: list[tuple[float, float]] = []
         self._dust: list[FloatArray] = []
+        self._grid: list[NDArray[np.float32]] = []
         self.counts = dict.fromkeys(
             ("read", "used", "not_finite", "beyond_surface", "outside_aperture", "outliers"), 0
         )
@@ -294,7 +302,11 @@ class _Gathered:
         dust = whole.part(usable & ~good)
         self._dust.append(np.stack([dust.x, dust.y, dust.deviation]))
         if np.any(good):
-            self._keep(whole.part(good), portion.systematic[:, good])
+            points = whole.part(good)
+            self._keep(points, portion.systematic[:, good])
+            if self.even:
+                places = portion.x[good], portion.y[good]
+                self._grid.append(np.array([*places, points.deviation], np.float32))
 
     def _keep(self, points: Placed, systematic: FloatArray) -> None:
         self.least = min(self.least, float(points.deviation.min()))
@@ -305,6 +317,22 @@ class _Gathered:
         pose, along = self._found.effects(part, systematic[:, few])
         rows = [part.x, part.y, part.deviation, *pose, *along]
         self._kept.add_chosen(np.stack(rows, axis=1), len(points.x))
+
+    @property
+    def missed(self) -> tuple[float, float]:
+        """How far points of a grid that were not kept reach below and above all others [m]."""
+        kept = self._kept.rows()[:, 2]
+        below, above = float(kept.min() - self.least), float(self.most - kept.max())
+        return (below, above) if self.even else (0.0, 0.0)
+
+    @property
+    def gradient(self) -> float | None:
+        """The rms gradient between all neighbours of a grid [1]; None without one."""
+        grid = as_grid(measured(*np.concatenate(self._grid, axis=1)))
+        if grid is None:
+            return None
+        slopes = (np.diff(grid.height, axis=k) / step for k, step in ((1, grid.dx), (0, grid.dy)))
+        return float(np.sqrt(sum(np.nanmean(along**2) for along in slopes)))
 
     @property
     def dust(self) -> FloatArray:

@@ -336,7 +336,7 @@ def _of_grid(x: FloatArray, y: FloatArray) -> tuple[tuple[float, float], float] 
         # Points of one column differ by rounding, and by what the tilt of the part moves them.
         apart = steps[steps > _LEAST_STEP * np.max(steps, initial=0.0)]
         spacings.append(float(np.median(apart)) if len(apart) else np.inf)
-    counts = [float(np.ptp(v) / step) + 1 for v, step in zip((x, y), spacings, strict=True)]
+    counts = [round(np.ptp(v) / step) + 1 for v, step in zip((x, y), spacings, strict=True)]
     if min(counts) < 2 or np.prod(counts) * _LEAST_FILLED > len(x):
         return None
     block = int(np.ceil(np.sqrt(np.prod(counts)) / _MOST_OF_GRID))

@@ -10,7 +10,7 @@ density is the mean square per radian of half a turn.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -137,13 +137,14 @@ class _FilteredBand:
 
 def texture(
     cells: GridCells, formless: GridCells, bands: Bands, points: DeviationMap | None = None,
-    rest: GridCells | None = None,
+    rest: GridCells | None = None, gradient: float | None = None,
 ) -> dict[str, UncertainValue]:  # fmt: skip
     """Return Sa, Sq, Sz [m], Ssk, Sku, Sdq [1] of the S-L surface, rms by band [m], slopes [1].
 
     formless: the same cells after the F-operation
     points: the S-L surface, None for that of the cells
     rest: the same cells without their second order, whose slope is found too
+    gradient: rms between all points of a grid [1], of which the cells hold blocks
     """
     shown = [cells] if rest is None else [cells, rest]
     images = [np.concatenate([c.mean[np.newaxis], c.effects]) for c in shown]
@@ -152,10 +153,15 @@ def texture(
     between = (bands.s_filter, bands.l_filter)
     surface = _band(formless, *between, levels) if points is None else _of_points(points)
     found = dict(zip(("Sa", "Sq", "Sz", "Ssk", "Sku"), surface.figures(_moments, 3), strict=True))
-    pairs = _band(formless, *between, levels, between=True)
+    lost, blocks = 0.0, formless
+    if gradient is not None:
+        # Blocks hold what the filters remove, and lose short waves.
+        lost = float(gradient**2 - np.mean(cells.between(cells.mean[np.newaxis]) ** 2))
+        blocks = replace(formless, width=0.0)
+    pairs = _band(blocks, *between, levels, between=True)
     found["Sdq"] = UncertainValue(None, None)
     if pairs.levels[0].size:
-        found["Sdq"] = pairs.figures(lambda v: np.sqrt(np.mean(v * v, keepdims=True)), 1)[0]
+        found["Sdq"] = pairs.figures(lambda v: np.sqrt(np.mean(v * v, keepdims=True) + lost), 1)[0]
     for name, (long, short) in bands.rms_bands.items():
         same = long and short in (None, bands.s_filter)
         band = _band(formless if long else cells, short, long, levels if same else None)

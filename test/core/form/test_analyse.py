@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from soaked import soaked
 
+from omsm_ros.core.form import analyse, deviation_map
 from omsm_ros.core.form.analyse import analyse_form
 from omsm_ros.core.registration.placement import PointBatch
 from omsm_ros.core.surface.aperture import Aperture
@@ -120,3 +121,20 @@ def test_a_profile_has_the_figures_of_its_line(turned):
         assert slope.value == pytest.approx(ripple * wave / np.sqrt(2), rel=0.05)
         both = np.hypot(ripple * wave / np.sqrt(2), 2 * 3e-6 / 0.02 / np.sqrt(3))
         assert found["slope_rms"].value == pytest.approx(both, rel=0.01)
+
+
+def test_points_that_the_map_does_not_hold_count_in_gradient_and_peak_to_valley(monkeypatch):
+    """White texture of 160 × 160 points in blocks of nine, every fourth one in the map."""
+    monkeypatch.setattr(deviation_map, "_MOST_OF_GRID", 64)
+    monkeypatch.setattr(analyse, "MOST_WEIGHED", 2**13)
+    step, size = 1e-5, 10e-9
+    y, x = np.indices((160, 160)) * step
+    height = size * np.random.default_rng(3).normal(size=x.shape)
+    height[81, 81] = -40 * size
+    asked = (x.ravel(), y.ravel(), height.ravel(), "piston", "tip", "tilt")
+    found = form(*asked, even=True, dust="none", filters=(None, 1.0)).deviation
+    true = np.sqrt(sum(np.mean(np.diff(height, axis=k) ** 2) for k in (0, 1))) / step
+    assert true == pytest.approx(2 * size / step, rel=0.1)
+    assert found["Sdq"].value == pytest.approx(true, rel=5e-3)
+    whole = found["peak_to_valley"]
+    assert abs(whole.value - np.ptp(height)) < 2 * whole.uncertainty < np.ptp(height)

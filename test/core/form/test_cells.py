@@ -233,3 +233,13 @@ def test_waves_shorter_than_the_cells_count_in_the_texture_of_points():
     found = texture(cells, cells, bands, short_waves(map_, cells, bands.l_filter))
     assert found["Sq"].value == pytest.approx(10e-9 / np.sqrt(2), rel=0.03)
     assert found["Sa"].value == pytest.approx(20e-9 / np.pi, rel=0.05)
+
+
+@pytest.mark.parametrize("step", [1e-9 / 1.024, 1e-5 / 3, 1.953125e-9])
+def test_a_grid_of_512_columns_has_as_many_cells(step):
+    """Rounding must not make the grid wider than the most cells that there are."""
+    x, y = (v.ravel() for v in np.meshgrid(*(np.arange(512) * step,) * 2))
+    map_ = DeviationMap(
+        x=x, y=y, deviation=x, area=np.ones(len(x)), effects=np.empty((0, len(x))), noise=0.0
+    )
+    assert GridCells.of(map_, even=True).mean.shape == (512, 512)
