@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.cli.arguments import Arguments, cell_of, refuse_cell
 from omsm_ros.cli.command import LIMIT, CliCommand, Facts, Rows, written
@@ -153,14 +154,12 @@ _SIGN = (
 
 def _offsets(previous: Path, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return total and last offsets (r, c) [m] of an earlier compensation.csv; FileError."""
-    from scipy.interpolate import NearestNDInterpolator  # takes 0.3 s to load
-
     try:
         table = np.loadtxt(previous, delimiter=",", skiprows=1, ndmin=2)
         values = table[:, [2, -1]] if table.shape[1] > _COLUMNS else table[:, [2, 2]]
     except (ValueError, IndexError, OSError) as err:
         raise FileError(f"{str(previous)!r} is no {COMPENSATION}: {err}") from err
-    found = NearestNDInterpolator(table[:, :2], values)(x, y)
+    found = scipy.interpolate.NearestNDInterpolator(table[:, :2], values)(x, y)
     return found[..., 0], found[..., 1]
 
 

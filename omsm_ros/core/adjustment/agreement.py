@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.families import DIFFERS
@@ -71,8 +72,6 @@ def agreement_of(
 def _compared(
     solution: Solution, scan: int, alone: Sequence[tuple[Figure, Figure]]
 ) -> ScanAgreement:
-    from scipy import special  # takes long to load
-
     one = alone[scan]
     others = [a for k, a in enumerate(alone) if k != scan]
     name = f"{DIFFERS}@{scan}"
@@ -85,7 +84,7 @@ def _compared(
         pv=_e_n(one[0], _mean([a[0] for a in others])),
         rms=_e_n(one[1], _mean([a[1] for a in others])),
         terms=terms,
-        limit=max(1.0, -float(special.ndtri(_BY_CHANCE / (2 * number))) / 2),
+        limit=max(1.0, -float(scipy.special.ndtri(_BY_CHANCE / (2 * number))) / 2),
         alone=one,
     )
 

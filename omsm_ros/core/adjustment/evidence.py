@@ -9,6 +9,7 @@ all others are fitted, ``χ² = sᵀ I⁻¹ s`` (Rao 1948).
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.adjustment.network import Solution
 from omsm_ros.core.adjustment.sources import Family
@@ -59,16 +60,14 @@ class Evidence:
     @property
     def deviate(self) -> float:
         """As many standard deviations as χ² is rare; large ones by their square root."""
-        from scipy import special  # takes long to load
-
         if not self.dof:
             return 0.0
         half, order = self.chi_square / 2, self.dof / 2
-        tail = special.gammaincc(order, half)
+        tail = scipy.special.gammaincc(order, half)
         # Beyond what a float holds, its asymptote.
-        far = (order - 1) * np.log(max(half, 1.0)) - half - special.gammaln(order)
+        far = (order - 1) * np.log(max(half, 1.0)) - half - scipy.special.gammaln(order)
         log_tail = np.log(tail) if tail > 1e-290 else far
-        return float(max(-special.ndtri_exp(log_tail - np.log(2.0)), 0.0))
+        return float(max(-scipy.special.ndtri_exp(log_tail - np.log(2.0)), 0.0))
 
 
 def evidence_of(solution: Solution, family: Family) -> Evidence:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 from scipy import optimize, signal
 
 from omsm_ros.core.estimation.noise import reading_step
@@ -123,8 +124,6 @@ def _normalised(record: MotionRecord, edges: list[Edge]) -> _Edges:
 
 def _axis(edges: _Edges, grid: FloatArray, period: float) -> tuple[FloatArray, FloatArray, float]:
     """Return the edge on ``grid`` [samples], the starts (e,), and the residual over its noise."""
-    from scipy.interpolate import CubicSpline
-
     step = period / _FINE
     start = edges.half - 1.5
 
@@ -137,7 +136,7 @@ def _axis(edges: _Edges, grid: FloatArray, period: float) -> tuple[FloatArray, F
 
     def residual(q: FloatArray) -> FloatArray:
         nonlocal start
-        curve = CubicSpline(grid, edge(q))
+        curve = scipy.interpolate.CubicSpline(grid, edge(q))
         slope = curve.derivative()
         for _ in range(6):
             at = np.clip(edges.place - start[:, np.newaxis], grid[0], grid[-1])

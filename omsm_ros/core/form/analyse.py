@@ -262,8 +262,7 @@ def _figures(
     if cells.width == 0 or bands.s_filter is not None:
         return figures, texture.texture(cells, formless, bands, None, rest_cells)
     points = short_waves(points, formless, bands.l_filter)
-    gradient = gathered.gradient if even else None
-    textures = texture.texture(cells, formless, bands, points, rest_cells, gradient)
+    textures = texture.texture(cells, formless, bands, points, rest_cells, gathered.gradient)
     gaps = None if even else gaps
     whole = extents_of_parts([points], smooth.disc, gaps, missed)[0][0]
     return figures, textures | {"Sq": _rms_to_rim(points, gaps), "Sz": whole}
@@ -321,14 +320,13 @@ class _Gathered:
     @property
     def missed(self) -> tuple[float, float]:
         """How far points of a grid that were not kept reach below and above all others [m]."""
-        kept = self._kept.rows()[:, 2]
-        below, above = float(kept.min() - self.least), float(self.most - kept.max())
-        return (below, above) if self.even else (0.0, 0.0)
+        kept, of_grid = self._kept.rows()[:, 2], float(self.even)
+        return of_grid * float(kept.min() - self.least), of_grid * float(self.most - kept.max())
 
     @property
     def gradient(self) -> float | None:
         """The rms gradient between all neighbours of a grid [1]; None without one."""
-        grid = as_grid(measured(*np.concatenate(self._grid, axis=1)))
+        grid = as_grid(measured(*np.concatenate(self._grid, axis=1))) if self._grid else None
         if grid is None:
             return None
         slopes = (np.diff(grid.height, axis=k) / step for k, step in ((1, grid.dx), (0, grid.dy)))

@@ -7,6 +7,7 @@ Shorter wavelengths are noise, texture, or too fast for the axes, and are not co
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.form.deviation_map import DeviationMap, GridCells
 from omsm_ros.core.kinematics.kinematics import Surface
@@ -51,11 +52,9 @@ class Compensation:
 
     def between(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the offsets [m] at x, y (n,) [m], linear between cells; NaN outside of them."""
-        from scipy.ndimage import map_coordinates  # takes 0.1 s to load
-
         at = [(v - g[0]) / (g[1] - g[0]) for v, g in ((y, self.y), (x, self.x))]
         total, weight = (
-            map_coordinates(values, at, order=1, mode="grid-constant")
+            scipy.ndimage.map_coordinates(values, at, order=1, mode="grid-constant")
             for values in (np.nan_to_num(self.offset), np.isfinite(self.offset).astype(np.float64))
         )
         return np.where(weight > 0, total / np.where(weight > 0, weight, 1.0), np.nan)
@@ -180,15 +179,13 @@ class CutSurface:
     """
 
     def __init__(self, nominal: Surface, x: FloatArray, y: FloatArray, offset: FloatArray) -> None:
-        from scipy import interpolate, ndimage  # takes 0.3 s to load
-
-        place = ndimage.distance_transform_edt(
+        place = scipy.ndimage.distance_transform_edt(
             ~np.isfinite(offset), return_distances=False, return_indices=True
         )
         self._nominal = nominal
         known = np.pad(offset[tuple(place)], _MARGIN, mode="edge")
         x, y = (v[0] + (v[1] - v[0]) * np.arange(-_MARGIN, len(v) + _MARGIN) for v in (x, y))
-        self._offset = interpolate.RectBivariateSpline(y, x, known)
+        self._offset = scipy.interpolate.RectBivariateSpline(y, x, known)
         self._limits = (x[0], x[-1], y[0], y[-1])
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.streams.statistics import noise_of, spread
@@ -88,13 +89,11 @@ _STRETCH, _LEAST_STRETCHES = 64, 8
 
 def neighbour_noise(x: FloatArray, y: FloatArray, deviation: FloatArray) -> float:
     """Return the noise of points (n,) in any order, from the plane through the nearest of each."""
-    from scipy.spatial import cKDTree  # takes long to load
-
     if len(x) <= _NEIGHBOURS:
         return noise_of(deviation)
     some = slice(None, None, -(-len(x) // _MOST_PREDICTED))
     places = np.column_stack([x, y])
-    tree = cKDTree(places, balanced_tree=False, compact_nodes=False)  # for few places
+    tree = scipy.spatial.cKDTree(places, balanced_tree=False, compact_nodes=False)  # for few places
     near = tree.query(places[some], _NEIGHBOURS + 1)[1][:, 1:]
     away = places[near] - places[some, np.newaxis]
     size = np.max(np.abs(away), axis=(1, 2), keepdims=True)
@@ -364,11 +363,9 @@ def _inverses(matrices: FloatArray) -> FloatArray:
 
 def _blurred(images: FloatArray, cutoffs: Sequence[float]) -> FloatArray:
     """Return images (…, r, c) times the Gaussian weights of ``cutoffs`` along y and x [cells]."""
-    from scipy.ndimage import correlate1d  # takes 0.1 s to load
-
     for axis, cutoff in zip((-2, -1), cutoffs, strict=True):
         kernel = gaussian_weights(2 * math.ceil(_REACH * cutoff) + 1, cutoff)
-        images = correlate1d(images, kernel[len(kernel) // 2], axis, mode="constant")
+        images = scipy.ndimage.correlate1d(images, kernel[len(kernel) // 2], axis, mode="constant")
     return images
 
 

@@ -17,6 +17,7 @@ from math import comb
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 from numpy.typing import NDArray
 
 from omsm_ros.core.form.deviation_map import DeviationMap, GridCells, UncertainValue
@@ -197,11 +198,10 @@ class SmoothTerms(NamedTuple):
 
 def short_waves(map_: DeviationMap, cells: GridCells, longest: float) -> DeviationMap:
     """Return the points less the waves of their ``cells`` longer than ``longest`` [m]."""
-    from scipy.ndimage import map_coordinates  # takes long to load
-
     images = cells.low_pass(longest)(np.concatenate([cells.mean[np.newaxis], cells.effects]))
     at = [(map_.y - cells.y[0]) / cells.steps[1], (map_.x - cells.x[0]) / cells.steps[0]]
-    low = np.array([map_coordinates(image, at, order=1, mode="nearest") for image in images])
+    between = scipy.ndimage.map_coordinates
+    low = np.array([between(image, at, order=1, mode="nearest") for image in images])
     return replace(map_, deviation=map_.deviation - low[0], effects=map_.effects - low[1:])
 
 
@@ -279,8 +279,6 @@ class Gaps(NamedTuple):
         strip: along the rim, for sums of piston and other terms, weighted by area
         guessed: the outline is around the points;  uncovered: share of it in wide gaps
         """
-        from scipy.spatial import cKDTree  # takes long to load
-
         extent = min(np.ptp(map_.x), np.ptp(map_.y))
         if len(map_) < _AROUND or extent < _REACH * spacing:
             return None
@@ -300,7 +298,8 @@ class Gaps(NamedTuple):
         parts = np.ceil(np.diff(way) / way[-1] * max(_PLACES, way[-1] / spacing) - 1e-6)
         at = np.interp(np.arange(parts.sum()), np.append(0, np.cumsum(parts)), way)
         rim = np.stack([np.interp(at, way, u), np.interp(at, way, v)])
-        away, near = cKDTree(np.stack([map_.x, map_.y], axis=1)[some]).query(rim.T, _AROUND)
+        tree = scipy.spatial.cKDTree(np.stack([map_.x, map_.y], axis=1)[some])
+        away, near = tree.query(rim.T, _AROUND)
         near, place = some[near], rim[0] + 1j * rim[1]
         du, dv = (np.roll(rim, -1, axis=1) - np.roll(rim, 1, axis=1)) / 2
         apart = map_.x[near].T + 1j * map_.y[near].T - place

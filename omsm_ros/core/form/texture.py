@@ -153,11 +153,10 @@ def texture(
     between = (bands.s_filter, bands.l_filter)
     surface = _band(formless, *between, levels) if points is None else _of_points(points)
     found = dict(zip(("Sa", "Sq", "Sz", "Ssk", "Sku"), surface.figures(_moments, 3), strict=True))
-    lost, blocks = 0.0, formless
-    if gradient is not None:
-        # Blocks hold what the filters remove, and lose short waves.
-        lost = float(gradient**2 - np.mean(cells.between(cells.mean[np.newaxis]) ** 2))
-        blocks = replace(formless, width=0.0)
+    blocks = formless if gradient is None else replace(formless, width=0.0)
+    # Blocks hold what the filters remove, and lose short waves.
+    held = cells.between(cells.mean[np.newaxis])
+    lost = 0.0 if gradient is None else float(gradient**2 - np.mean(held**2))
     pairs = _band(blocks, *between, levels, between=True)
     found["Sdq"] = UncertainValue(None, None)
     if pairs.levels[0].size:

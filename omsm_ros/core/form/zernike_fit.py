@@ -13,6 +13,7 @@ from math import comb
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 from numpy.typing import NDArray
 
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
@@ -179,9 +180,6 @@ class RimStrip(NamedTuple):
 
         places: x, y of the points (2, n) [m];  weights: of them (n,);  spacing: of the tracks [m]
         """
-        from scipy.sparse import csr_array  # these take long to load
-        from scipy.spatial import cKDTree
-
         if outline.outline == "polygon":
             return None
         outline = outline.disc if outline.outline == "annulus" else outline
@@ -200,7 +198,8 @@ class RimStrip(NamedTuple):
         u, v = np.mean(groups[:, together], axis=2)
         if len(u) < _AROUND:
             return None
-        tree, middle = cKDTree(np.column_stack([u, v])), np.array([[outline.x], [outline.y]])
+        tree = scipy.spatial.cKDTree(np.column_stack([u, v]))
+        middle = np.array([[outline.x], [outline.y]])
         # Steps along a track may be longer than the distance of the tracks.
         known = tree.query((rim + middle).T)[0] < _REACH * max(spacing, along * step)
         nodes, shares = np.polynomial.legendre.leggauss(_NODES)
@@ -212,7 +211,7 @@ class RimStrip(NamedTuple):
         away = (u[near] - at[0, :, np.newaxis]) + 1j * (v[near] - at[1, :, np.newaxis])
         outwards = np.repeat(rim[0] - 1j * rim[1], _NODES)[:, np.newaxis]
         shares_of = continued(away * outwards / np.abs(outwards) / spacing)
-        own = weights[points] * known[cKDTree((rim + middle).T).query(near_rim.T)[1]]
+        own = weights[points] * known[scipy.spatial.cKDTree((rim + middle).T).query(near_rim.T)[1]]
         # The points stand for the covered part of the outline only.
         covered = max(float(np.sum(triangles[known])), 1e-300) * (1 - (1 - 2 * depth) ** 2)
         area = np.outer(triangles * known * np.sum(own) / covered, shares).ravel()
@@ -221,7 +220,8 @@ class RimStrip(NamedTuple):
         sums *= own * _fading((1 - size[points]) / depth)
         parabola, plane = np.zeros((2, *sums.shape))
         for made, share in zip((parabola, plane), shares_of, strict=True):
-            each = csr_array((share.ravel(), near.ravel(), begins), (len(area), len(u)))
+            rows = share.ravel(), near.ravel(), begins
+            each = scipy.sparse.csr_array(rows, (len(area), len(u)))
             of_means = np.repeat(columns * area @ each / along, along, axis=1)
             made[:, np.flatnonzero(np.repeat(together, along))] = of_means
         return cls(points, parabola - sums, (parabola - plane) / 2)

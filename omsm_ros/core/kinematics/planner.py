@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.streams.blocks import FloatArray
 
@@ -71,12 +72,10 @@ def executed(at: FloatArray, time: FloatArray, values: FloatArray, cycle: float)
 
 def averaged(at: FloatArray, time: FloatArray, values: FloatArray, ramp: float) -> FloatArray:
     """Return the polygon through ``values`` (n,) at ``time`` (n,), averaged over ``ramp`` [s]."""
-    from scipy.interpolate import make_interp_spline  # takes 0.3 s to load
-
     reach = ramp + max(float(time[0] - np.min(at)), float(np.max(at) - time[-1]), 0.0)
     longer = np.concatenate([[time[0] - reach], time, [time[-1] + reach]])
     held = np.concatenate([values[:1], values, values[-1:]])
-    integral = make_interp_spline(longer, held, k=1).antiderivative()
+    integral = scipy.interpolate.make_interp_spline(longer, held, k=1).antiderivative()
     return np.asarray((integral(at + ramp / 2) - integral(at - ramp / 2)) / ramp)
 
 

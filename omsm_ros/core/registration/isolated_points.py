@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.registration.placement import Placed
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
@@ -127,11 +128,9 @@ class FarPoints:
 
         The form rolls off between the last points of lines, which no other point confirms.
         """
-        from scipy.special import bdtrc
-
         single = np.unique(event[~form])
         at_end = np.intersect1d(single, event[rows[5] > 0])
-        chance = bdtrc(len(at_end) - 1.0, len(single), self.ends / self.points)
+        chance = scipy.special.bdtrc(len(at_end) - 1.0, len(single), self.ends / self.points)
         return np.isin(event, at_end) & bool(chance < _BY_CHANCE)
 
     def _like_surroundings(
@@ -142,14 +141,12 @@ class FarPoints:
         A slope of the form crosses the limit between two points, and a pip in the centre of a
         spiral is crossed by few turns. Points of the same event do not count.
         """
-        from scipy.spatial import cKDTree
-
         if not len(at):
             return np.zeros(0, bool)
         others = np.concatenate([rows, *self.near], axis=1)
         events = np.append(event, np.full(others.shape[1] - len(event), -1))
-        pairs = cKDTree(rows[1:3, at].T).sparse_distance_matrix(
-            cKDTree(others[1:3].T), space.reach, output_type="coo_matrix"
+        pairs = scipy.spatial.cKDTree(rows[1:3, at].T).sparse_distance_matrix(
+            scipy.spatial.cKDTree(others[1:3].T), space.reach, output_type="coo_matrix"
         )
         ratio = others[3][pairs.col] / rows[3][at][pairs.row]
         like = (ratio > 1 / _SIMILAR) & (events[pairs.col] != event[at][pairs.row])
@@ -166,19 +163,17 @@ class FarPoints:
         Those that stand out from all around are dust. Where few points are around, no more of them
         are than the dust elsewhere lets expect, the highest: others are form as narrow as tracks.
         """
-        from scipy.spatial import cKDTree
-        from scipy.special import pdtrik
-
         if space.line or not np.any(form):
             return form
         others = np.concatenate([rows, *self.near], axis=1)
-        away, nearest = cKDTree(rows[1:3, form].T).query(rows[1:3].T)
+        away, nearest = scipy.spatial.cKDTree(rows[1:3, form].T).query(rows[1:3].T)
         about = (away <= space.reach) & (rows[3] * rows[3, form][nearest] > 0)
         # A Poisson number of the points about the form are dust.
         around = float(np.sum(about) + others.shape[1] - len(form))
         expected = float(np.sum(~about)) * around / self.points
         most, rare = int(expected + _CHANCE * np.sqrt(expected)), _BY_CHANCE / max(expected, 1.0)
-        steep, size, tree = np.where(form, 0.0, np.abs(rows[3])), others[3], cKDTree(others[1:3].T)
+        steep, size = np.where(form, 0.0, np.abs(rows[3])), others[3]
+        tree = scipy.spatial.cKDTree(others[1:3].T)
         open_, track = np.flatnonzero(form), np.zeros(self.read + 2)
         while True:
             track[others[0].astype(np.int64)] = size
@@ -190,7 +185,8 @@ class FarPoints:
                 same = np.where(there, np.append(size, 0.0)[near[:, 1:]], 0.0)
                 ranked = np.sort(same * np.sign(rows[3, part])[:, np.newaxis], axis=1)
                 # As many of those around as chance puts next to one are grains too, but not most.
-                company = np.ceil(pdtrik(1 - rare, space.around(rows[4, part]) * expected / around))
+                mean = space.around(rows[4, part]) * expected / around
+                company = np.ceil(scipy.special.pdtrik(1 - rare, mean))
                 company = np.clip(company, 0, np.maximum(there.sum(axis=1) // 2 - 1, 0))
                 level = ranked[np.arange(len(part)), -1 - company.astype(np.int64)]
                 full, height = there[:, -1], np.abs(rows[3, part])
@@ -210,7 +206,7 @@ class FarPoints:
             if not len(highest):
                 break
             about[highest], size[highest], most = False, 0.0, most - len(highest)
-            away, _ = cKDTree(rows[1:3, highest].T).query(rows[1:3].T)
+            away, _ = scipy.spatial.cKDTree(rows[1:3, highest].T).query(rows[1:3].T)
             open_ = np.flatnonzero(form & about & (away <= space.reach))
         return np.asarray(about)
 
@@ -264,11 +260,6 @@ def _clusters(
 
     similar: factor by which the sizes of neighbours differ at most
     """
-    # Imported here, because clean measurements do not need them.
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
     x, y, residual = rows[1:4]
     # One point for each half reach along an event, the farthest from the form, is enough.
     way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
@@ -278,13 +269,15 @@ def _clusters(
     ahead = np.ones(len(order), bool)
     ahead[1:] = (np.diff(event[order]) != 0) | (np.diff(part[order]) != 0)
     some = order[ahead]
-    pairs = cKDTree(np.column_stack([x, y])[some]).query_pairs(reach, output_type="ndarray")
+    tree = scipy.spatial.cKDTree(np.column_stack([x, y])[some])
+    pairs = tree.query_pairs(reach, output_type="ndarray")
     one, other = some[pairs[:, 0]], some[pairs[:, 1]]
     ratio = residual[one] / residual[other]
     linked = (ratio > 1 / similar) & (ratio < similar)
     links = np.ones(int(linked.sum())), (event[one[linked]], event[other[linked]])
     count = int(event[-1]) + 1
-    group = connected_components(coo_array(links, (count, count)), directed=False)[1]
+    graph = scipy.sparse.coo_array(links, (count, count))
+    group = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     # One more pair that is similar, because of few none may be by chance.
     sizes = np.sort(np.abs(residual[some]))
     near = np.searchsorted(sizes, similar * sizes) - np.arange(1, len(sizes) + 1)
@@ -338,8 +331,6 @@ def _no_chance(
     cluster: of each event (m,);  rows: of its first point (6, m)
     similar: share of pairs of events that are similar by chance
     """
-    from scipy.special import gammaln
-
     sizes = np.bincount(cluster)
     total = float(np.sum(sizes == 1))
     dense = total * np.maximum(space.around(rows[4]) / points, space.share)
@@ -348,5 +339,6 @@ def _no_chance(
     chance = chance * similar * np.exp(np.minimum(chance * similar, 1.0))
     chance = np.clip(chance, np.finfo(np.float64).tiny, 1.0)
     among = chance * sizes
-    expected = total * np.exp(chance + (sizes - 1) * np.log(among) - among - gammaln(sizes + 1.0))
+    rest = among + scipy.special.gammaln(sizes + 1.0)
+    expected = total * np.exp(chance + (sizes - 1) * np.log(among) - rest)
     return np.asarray((expected < _BY_CHANCE) & (sizes > 1))

@@ -14,6 +14,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration import form_model
@@ -171,13 +172,11 @@ def _measured_area(x: FloatArray, y: FloatArray, outline: Aperture, even: bool) 
     Where points x, y (n,) [m] cover the ``outline``, these are its nodes, else an even grid: areas
     of single points are not exact, so that coma would have a tilt.
     """
-    from scipy.spatial import cKDTree  # takes long to load
-
     nodes, step = outline.nodes(), float(np.median(np.hypot(np.diff(x), np.diff(y))))
     whole, path = float(np.sum(nodes[2])), step * len(x)  # a jump to the next line is no part of it
     track = max(float(np.sqrt(whole / len(x))), whole / (path or np.inf))
     if whole and min(np.ptp(x), np.ptp(y)) > _FEWEST_TRACKS * track:
-        away, _ = cKDTree(np.column_stack([x, y])).query(nodes[:2].T)
+        away, _ = scipy.spatial.cKDTree(np.column_stack([x, y])).query(nodes[:2].T)
         if np.max(away) < _NEXT_TRACK * track:
             return nodes
         if not even:

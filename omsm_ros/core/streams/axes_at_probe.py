@@ -11,9 +11,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.streams.blocks import (
     AngleUnwrapper,
@@ -26,9 +27,6 @@ from omsm_ros.core.streams.blocks import (
 from omsm_ros.core.streams.continuity import TriggerCount
 from omsm_ros.core.streams.stamps import StampClock, fit_clock
 from omsm_ros.errors import ConfigurationError, DataError
-
-if TYPE_CHECKING:
-    from scipy.interpolate import BSpline
 
 # A cubic spline would be off by 2.6 nm on the motion in test_motion_record.py, a quintic is not.
 _SPLINE_DEGREE = 5
@@ -82,20 +80,17 @@ class _Track:
     origin_ns: int
     begin: float
     end: float
-    spline: BSpline | None
+    spline: scipy.interpolate.BSpline | None
 
     @classmethod
     def of(cls, run: Sequence[AxisBlock], clock: StampClock) -> _Track:
         values = np.stack([np.concatenate([getattr(b, name) for b in run]) for name in _AXES], 1)
         count = run[0].first_sample + np.arange(len(values), dtype=np.float64)
         time = clock.since(count, run[0].stamp_ns)
-        # Imported here: it takes longer to load than a scan to correct, and few users need it.
-        from scipy.interpolate import make_interp_spline
-
-        usable = len(values) > _SPLINE_DEGREE and bool(np.all(np.isfinite(values)))
-        if usable:
+        spline = None
+        if len(values) > _SPLINE_DEGREE and bool(np.all(np.isfinite(values))):
             values[:, _C] = AngleUnwrapper().of(values[:, _C])
-        spline = make_interp_spline(time, values, _SPLINE_DEGREE) if usable else None
+            spline = scipy.interpolate.make_interp_spline(time, values, _SPLINE_DEGREE)
         return cls(run[0].stamp_ns, float(time[0]), float(time[-1]), spline)
 
 

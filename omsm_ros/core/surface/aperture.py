@@ -7,6 +7,7 @@ from itertools import combinations
 from typing import Literal, get_args
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
@@ -227,8 +228,6 @@ def best_covered(
 
     Wider gaps than holes of random points count; the rim may lie a track within the aperture's.
     """
-    from scipy import ndimage  # takes long to load
-
     box = [(float(np.ptp(v)) / 2, float(v.max() + v.min()) / 2) for v in (x, y)]
     sizes = [half for half, _ in box] + [middle for _, middle in box]
     track = max(track, 2 * float(np.sqrt(sizes[0] * sizes[1] / len(x))))
@@ -244,8 +243,8 @@ def best_covered(
     ends = [np.arange(m - half, m + half + pitch, pitch) for m in (aperture.x, aperture.y)]
     empty = np.histogram2d(x, y, ends)[0] == 0
     # Morphological closing (Serra 1982) with a disc: dilation followed by erosion.
-    near = ndimage.distance_transform_edt(empty) <= reach
-    open_ = ndimage.distance_transform_edt(near) <= reach
+    near = scipy.ndimage.distance_transform_edt(empty) <= reach
+    open_ = scipy.ndimage.distance_transform_edt(near) <= reach
     shapes = [aperture]
     if free:
         around_points = [Aperture.of(outline, *sizes) for outline in ("rectangle", "ellipse")]

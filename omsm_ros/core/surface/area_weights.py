@@ -13,6 +13,7 @@ It depends on the path of the scan.
 from collections.abc import Callable
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 from numpy.typing import NDArray
 
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
@@ -175,9 +176,6 @@ def _scanned(
     also to the ``outline``. At wider ones, a point stands for half a step along its track, and half
     the distance of two tracks across.
     """
-    # Imported here: it takes as long to load as to weigh a scan, and spirals do not need it.
-    from scipy import ndimage
-
     even = int(np.clip(np.sqrt(len(x)), 1, _MOST_CELLS))
     side = min(_FINER * even, _MOST_CELLS)
     cell, shape = _tiles(x, y, side)
@@ -191,14 +189,15 @@ def _scanned(
     # Morphological closing (Serra 1982) with a disc: dilation followed by erosion.
     margin = int(np.ceil(reach)) + 1
     wide = np.pad(filled, margin)
-    nearest = ndimage.distance_transform_edt(~wide, return_distances=False, return_indices=True)
+    distances = scipy.ndimage.distance_transform_edt
+    nearest = distances(~wide, return_distances=False, return_indices=True)
     sides = [(np.ptp(v) or 1.0) / n for v, n in zip((x, y), shape, strict=True)]
     at = [v.min() + (np.arange(-margin, n + margin) + 0.5) * size
           for v, n, size in zip((x, y), shape, sides, strict=True)]  # fmt: skip
     middles = np.stack(np.meshgrid(*at, indexing="ij"))
     inside = np.ones(wide.shape, bool) if outline is None else outline.holds(*middles)
-    far = ndimage.distance_transform_edt(inside & ~wide)
-    away = ndimage.distance_transform_edt(far <= reach)
+    far = scipy.ndimage.distance_transform_edt(inside & ~wide)
+    away = scipy.ndimage.distance_transform_edt(far <= reach)
     scanned = (away > reach) & inside | wide
     if outline is not None and np.any(far > reach):
         places, area = inside & ~scanned & (away > 0), np.sum(scanned) * float(np.prod(sides))
@@ -210,13 +209,11 @@ def _stand_for(
     points: NDArray[np.complex128], places: NDArray[np.complex128], area: float
 ) -> BoolArray:
     """Return for which ``places`` (k,) [m] the ``points`` (n,) of a path over an ``area`` stand."""
-    from scipy.spatial import cKDTree  # takes long to load
-
     step, jumps = _steps(points, float(np.sqrt(area / len(points))))
     sizes = np.abs(np.diff(points))
     track = area / (np.sum(sizes) - np.sum(sizes[jumps]))
     rows = (v.view(np.float64).reshape(-1, 2) for v in (points, places))
-    _, near = cKDTree(next(rows)).query(next(rows), _AROUND)
+    _, near = scipy.spatial.cKDTree(next(rows)).query(next(rows), _AROUND)
     step = step[near]
     # Along the track and across it, times the step.
     apart, size = (places[:, np.newaxis] - points[near]) * step.conj(), np.abs(step)
@@ -234,13 +231,11 @@ def errors_at_gaps(
 
     track: distance of neighbouring tracks [m]
     """
-    from scipy.sparse import csr_array  # these take long to load
-    from scipy.spatial import cKDTree
-
     points, every = x + 1j * y, max(len(x) // _MOST_AT_GAPS, 1)
     track = max(track, float(np.sqrt(np.ptp(x) * np.ptp(y) / len(x))))  # of every k-th point
     (step, _), steps = _steps(points, track), np.diff(points)
-    tree, few, size = cKDTree(np.column_stack([x, y])), np.arange(0, len(x), every), np.abs(step)
+    tree = scipy.spatial.cKDTree(np.column_stack([x, y]))
+    few, size = np.arange(0, len(x), every), np.abs(step)
     # A path ends at a gap where it jumps over it, or turns.
     last, first = (1 + np.flatnonzero(np.abs(np.diff(steps)) > np.abs(s))
                    for s in (steps[:-1], steps[1:]))  # fmt: skip
@@ -256,7 +251,7 @@ def errors_at_gaps(
     new, own, errors = (np.concatenate(v) for v in zip(*found, strict=True))
     begins = np.append(np.flatnonzero(new), len(own))
     rows = errors / np.sum(size) / np.sqrt(12), own, begins
-    areas = csr_array(rows, (len(begins) - 1, len(x)))
+    areas = scipy.sparse.csr_array(rows, (len(begins) - 1, len(x)))
     return lambda values: np.asarray(areas @ values.T)
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
@@ -103,19 +104,17 @@ class GridSurface:
     """
 
     def __init__(self, grid: HeightGrid) -> None:
-        # Imported here: it takes 0.3 s to load.
-        from scipy.interpolate import RectBivariateSpline, RegularGridInterpolator
-
         if min(grid.height.shape) < 4:
             raise DataError("surface.small_map", shape=grid.height.shape)
         self._grid = grid
         # Missing places are filled, so that the spline in the complete cells is smooth.
         filled = np.where(np.isfinite(grid.height), grid.height, _filled(grid.height))
-        self._spline = RectBivariateSpline(grid.y, grid.x, filled)
+        self._spline = scipy.interpolate.RectBivariateSpline(grid.y, grid.x, filled)
         # NaN where one of the four places around is missing; the edges belong to the map.
         y, x = (np.r_[v[0] - s, v[1:-1], v[-1] + s] for v, s in
                 ((grid.y, _SLACK * grid.dy), (grid.x, _SLACK * grid.dx)))  # fmt: skip
-        self._linear = RegularGridInterpolator((y, x), grid.height, bounds_error=False)
+        linear = scipy.interpolate.RegularGridInterpolator
+        self._linear = linear((y, x), grid.height, bounds_error=False)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]; NaN where the map has none."""
