@@ -48,10 +48,10 @@ def run(
     notes: list[str] = []
     got: list[BlockPair] = []
     device = Scripted(stop, opens, polls)
-    reader = DeviceReader(
-        device, got.extend, notes.append, lambda text: notes.append(f"! {text}"), (1e-3, 4e-3)
-    )
-    reader.run(stop)
+    reader = DeviceReader(device, got.extend, notes.append, lambda text: notes.append(f"! {text}"))
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("omsm_ros.instruments.reader.BACK_OFF_S", (1e-3, 4e-3))
+        reader.run(stop)
     assert device.closed >= 1
     assert reader.state is State.ENDED
     return reader, notes, got
