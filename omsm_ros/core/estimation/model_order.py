@@ -79,13 +79,14 @@ def explore(
     order: int = 0,
     colour_of: Callable[[Fit], float] = lambda fit: 1.0,
     budget: EvaluationBudget | None = None,
+    least: int = 0,
 ) -> list[Candidate]:
     """Fit structures of rising order until two more poles in a row gain nothing.
 
     order: number of poles to go to in any case
     colour_of: returns that of the noise that a fit leaves, see :func:`information`; the best of
         each order gives it anew, because motion that a poor model leaves is no noise
-    budget: of the fits; no further order is tried once it is exhausted
+    budget: of the fits; no order beyond ``least`` is tried once it is exhausted
 
     Raises IdentificationError for an order out of range.
     """
@@ -103,7 +104,7 @@ def explore(
         found = [Candidate(c.fit, information(c.fit, colour)) for c in found]
         if poles < order:
             continue
-        if fruitless >= 2 or (poles < _FREE_POLES and budget is not None and budget.stops()):
+        if fruitless >= 2 or (least <= poles < _FREE_POLES and budget and budget.stops()):
             break
     return found
 

@@ -29,6 +29,7 @@ from omsm_ros.core.estimation.covariance import gain_uncertainty_alone, paramete
 from omsm_ros.core.estimation.model_order import fit
 from omsm_ros.core.estimation.noise import CLEARLY, VERY_STRONG
 from omsm_ros.core.identification.model_error_search import ModelledTerm, SearchResult
+from omsm_ros.core.identification.residual_tests import NOTICEABLE
 from omsm_ros.core.identification.response_uncertainty import IdentificationEvidence
 from omsm_ros.core.lti.frequency_response import (
     COVERAGE_FACTOR,
@@ -68,8 +69,6 @@ LEAST_CHI_SQUARE = 0.3
 _LONGEST_LAG_S, _LONGEST_LAG_SAMPLES = 0.1, 5.0
 # Linear probes are right to one per cent; one that sees Z at 10° reads 0.985 of it.
 _SCALE_ERROR = 0.05
-# Share of the variance of a reading above which encoder noise is warned of.
-_NOTICEABLE_SHARE = 0.1
 
 
 def separable_gain(e: IdentificationEvidence) -> Findings:
@@ -137,7 +136,7 @@ def recording(e: IdentificationEvidence) -> Findings:
             yield Finding(code, RESERVATION, {"scatter_s": scatter})
     errors = e.prepared.problem.errors_in_variables
     found = 0.0 if errors is None else float(np.sqrt(np.mean(errors**2)))
-    if found**2 > _NOTICEABLE_SHARE * e.residual.noise**2:
+    if found**2 > NOTICEABLE * e.residual.noise**2:
         yield Finding("identification.encoder_noise", WARNING, {"noise_m": found})
     if e.prepared.axis_spikes:
         yield Finding("identification.axis_spikes", WARNING, {"count": e.prepared.axis_spikes})
@@ -233,9 +232,6 @@ def late_reference(e: IdentificationEvidence) -> Findings:
     code = "identification.late_reference" if lag.value > 0 else "identification.early_reference"
     values = {"lag_s": abs(lag.value), "uncertainty_s": lag.uncertainty}
     yield Finding(code, REJECTS, values, {"reference_lag_greatest_s": harmless})
-
-
-# How far the result may be trusted.
 
 
 def usable(e: IdentificationEvidence) -> Findings:

@@ -75,7 +75,6 @@ from omsm_ros.errors import ConfigurationError, IdentificationError, StepTestErr
 from omsm_ros.linear_algebra import one_blas_thread, unit_columns
 from omsm_ros.quantities import MASS
 
-DEFAULT_LIMITS = ResponseLimits()
 NO_ORIGIN = Origin()
 Progress = Callable[..., object]
 # Stages of an identification, as the action states them.
@@ -196,7 +195,7 @@ def _evidence(
     use: IntendedUse,
 ) -> IdentificationEvidence:
     """Return what the checks use: the uncertainty of the response, and what it consists of."""
-    prepared, model, limits = searched.prepared, searched.model, DEFAULT_LIMITS
+    prepared, model, limits = searched.prepared, searched.model, ResponseLimits()
     drift = [added.columns for added in searched.nuisance_terms if added.term.family == DRIFT]
     best, diagnostics = model.chosen.fit, searched.diagnostics
     further, undetected = undetected_covariance(diagnostics, priors, drift, use)
@@ -231,9 +230,9 @@ def table_mass(settings: Mapping[str, object]) -> float | None:
 
 
 def _chosen(
-    prepared: Prepared, budget: EvaluationBudget, before: ChosenModel | None = None, *, order: int
+    prepared: Prepared, budget: EvaluationBudget, **choice: Any
 ) -> tuple[Prepared, ChosenModel]:
-    prepared, model = model_from_start(prepared, budget, before, order=order)
+    prepared, model = model_from_start(prepared, budget, **choice)
     check_gain(model.chosen.fit.gain, slack=_GAIN_SLACK)
     return prepared, model
 

@@ -82,17 +82,20 @@ def choose_model(
     budget: EvaluationBudget | None = None,
     order: int = 0,
     before: ChosenModel | None = None,
+    kept: ChosenModel | None = None,
 ) -> ChosenModel:
     """Fit structures to the prepared problem and choose one.
 
     budget: of the evaluations; None for a budget of its own
     order: number of poles, 0 to choose it. The free choice is made in any case.
     before: chosen for nearly the same problem; structures start from its fits, up to its order
+    kept: chosen before, with fewer columns: its fit is a start too, which more columns can only
+        improve, and an exhausted ``budget`` ends the search at no lower order
     """
     problem, budget = prepared.problem, budget or EvaluationBudget()
-    part = problem.sums
+    part, earlier = problem.sums, before or kept
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget, part=part)
-    known = {c.fit.structure: c.fit for c in before.explored} if before else {}
+    known = {c.fit.structure: c.fit for c in earlier.explored} if earlier else {}
     lines = part or problem.lines
     # Structures in a row often start from the lines that the same fit has filled.
     refilled = lru_cache(maxsize=1)(lines.filled) if lines else None
@@ -100,16 +103,18 @@ def choose_model(
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
         if structure == lag.structure:
             return lag
-        same = known.get(structure)
+        same = known.get(structure) if before or budget.exhausted else None
         best = min(smaller, key=lambda fit: fit.sum_of_squares, default=lag)
         filled = refilled and refilled(best)
         points = StartingPoints(filled or problem, lag)
         starts = points.of(structure, smaller) if same is None else [same.nonlinear]
+        if kept and structure == kept.chosen.fit.structure:
+            starts.append(kept.chosen.fit.nonlinear)
         return fit(problem, structure, starts, budget=budget, part=filled if part else None)
 
     colour_of = lru_cache(maxsize=1)(lambda fit: noise_colour(problem, fit, prepared.steps))
-    least = before.chosen.fit.structure.poles if before else 0
-    explored = explore(fit_structure, max(order, least), colour_of, budget)
+    least = (earlier.free or earlier).chosen.fit.structure.poles if earlier else 0
+    explored = explore(fit_structure, max(order, least * bool(before)), colour_of, budget, least)
     colour = colour_of(min((c.fit for c in explored), key=lambda fit: fit.sum_of_squares))
     duration = len(problem.input) * problem.period
     candidates = [
@@ -146,19 +151,18 @@ def _relaxes(dynamics: TransferFunction) -> bool:
 def model_from_start(
     prepared: Prepared,
     budget: EvaluationBudget | None = None,
-    before: ChosenModel | None = None,
-    *,
     order: int = 0,
+    **earlier: ChosenModel,
 ) -> tuple[Prepared, ChosenModel]:
     """Choose a model, with the initial-condition response where the record starts during one.
 
-    Returns the problem as it was fitted, and the model; ``before``: see :func:`choose_model`.
+    Returns the problem as it was fitted, and the model; ``earlier``: see :func:`choose_model`.
     """
     budget = budget or EvaluationBudget()
-    model = choose_model(prepared, budget, order, before)
+    model = choose_model(prepared, budget, order, **earlier)
     colour = noise_colour(prepared.problem, model.chosen.fit, prepared.steps)
     at_rest = not prepared.steps.moving[0]
     if not has_initial_response(prepared.problem, model.chosen.fit, colour, at_rest=at_rest):
         return prepared, model
     prepared = replace(prepared, problem=replace(prepared.problem, fits_initial_condition=True))
-    return prepared, choose_model(prepared, budget, order)
+    return prepared, choose_model(prepared, budget, order, kept=model)

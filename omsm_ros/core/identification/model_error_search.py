@@ -173,8 +173,7 @@ class _Search:
             self.grown.append(at_fitted_pole(shown[0].term, self.model.chosen.fit))
             self.without.append(diagnostics)
             return True
-        before = self.model if self.budget.exhausted else None
-        self.prepared, self.model = self.choose(self.prepared, self.budget, before)
+        self.prepared, self.model = self.choose(self.prepared, self.budget, kept=self.model)
         return True
 
     def new(self, judged: ScoreTest) -> bool:
@@ -194,7 +193,7 @@ def _initial_model(
     if columns := _modelled_as_poles(prepared, model, budget):
         prepared, added = _with_columns(prepared, columns, nuisance_terms)
         nuisance_terms += added
-        prepared, model = choose(prepared, budget)
+        prepared, model = choose(prepared, budget, kept=model)
     return prepared, nuisance_terms, model, budget
 
 
@@ -214,7 +213,7 @@ def _with_errors_in_variables(
         if problem is None:
             break
         quieter, own = replace(prepared, problem=problem), EvaluationBudget(watch=budget.watch)
-        quieter, found = choose(quieter, own, best[1])
+        quieter, found = choose(quieter, own, before=best[1])
         if information(found.chosen.fit) >= information(before):
             break
         best = quieter, found, own

@@ -33,7 +33,7 @@ from omsm_ros.linear_algebra import inverse_root
 # Then it is known to a tenth.
 _LEAST_CROSSINGS = 50
 # Shares of an excess that explain it, and of the noise that are worth telling.
-_MOST, _SHOWS = 0.5, 0.1
+_MOST, NOTICEABLE = 0.5, 0.1
 # Below the resolution of any probe; a misfit below it is none.
 _FINEST_READING_M = 1e-10
 # Resolves 1 Hz; a step test has a few edges in each segment. Fewer than eight lines show nothing.
@@ -99,7 +99,7 @@ def _axis_timing(
     recorded = problem.input if problem.recorded is None else problem.recorded
     scatter = motion_scatter(recorded, rate)
     makes = scatter**2 * float(np.mean(rate[moves] ** 2)) * fitted.mean_power(problem.period)
-    return scatter if makes > max(_MOST * excess, _SHOWS * noise**2) else 0.0
+    return scatter if makes > max(_MOST * excess, NOTICEABLE * noise**2) else 0.0
 
 
 def noise_colour(problem: Problem, fitted: Fit, steps: Steps) -> float:

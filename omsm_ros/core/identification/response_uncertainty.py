@@ -401,8 +401,7 @@ def _symmetric(matrix: FloatArray) -> FloatArray:
 
 
 def _frequencies(problem: Problem) -> FloatArray:
-    nyquist = 0.5 / problem.period
-    return np.asarray(np.geomspace(1e-4 * nyquist, nyquist, GRID_POINTS))
+    return np.asarray(0.5 / problem.period * np.geomspace(1e-4, 1, GRID_POINTS))
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,7 +38,7 @@ from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.errors import ConfigurationError, IdentificationError, Notice
-from omsm_ros.linear_algebra import one_blas_thread
+from omsm_ros.linear_algebra import ROUNDING, one_blas_thread
 
 # Limits of the band, a tenth of gain and of a radian: for a process, not a measuring machine.
 SAMPLED_LIMITS = ResponseLimits(gain=0.1, phase=0.1)
@@ -52,8 +52,6 @@ _NEARBY, _LEAST_POWER = 1e-3, 1e-8
 # Part of a record that is tapered, and the least share of the power of neighbouring lines that
 # remains where they are excited.
 _TAPER, _LEAKED = 0.2, 0.1
-# Singular value of unit columns below which inputs are not distinguished.
-_COLLINEAR = 1e-3
 # Power of a line over the largest of its block from which it counts for the range of the block.
 _STRONG = 0.1
 # Standard uncertainties beyond which a difference is not chance, and the largest share of blocks
@@ -249,12 +247,12 @@ def _compared(
     scale = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
     columns /= scale
     turned, sizes, directions = np.linalg.svd(columns, full_matrices=False)
-    inverse = directions.conj().T / np.where(sizes > _COLLINEAR, sizes, np.inf) @ turned.conj().T
+    inverse = directions.conj().T / np.where(sizes > ROUNDING, sizes, np.inf) @ turned.conj().T
     solved = inverse @ residual
     left = residual - columns @ solved
     variance = float(np.sum(np.abs(left) ** 2)) / max(len(residual) - columns.shape[1], 1)
     spread = np.sqrt(variance * np.sum(np.abs(inverse) ** 2, axis=1)) / scale
-    if sizes[-1] <= _COLLINEAR:
+    if sizes[-1] <= ROUNDING:
         spread[:] = np.inf
     inputs, power = len(driven), np.sum(powers, axis=0)
     strong = frequency[power > _STRONG * np.max(power)]
@@ -308,6 +306,11 @@ def valid_range(
     upheld = special.gammaincc(count, excess) > np.exp(-(_SIGNIFICANT**2))
     upheld |= np.sum(near * ~within, axis=1) <= MAY_DIFFER * count
     inside = (_narrow(sections.band(frequency, input), apart) & upheld) | agrees
+    # A mode that rings may be between excited lines, and narrower than a block.
+    poles = sections.poles()
+    modes = np.abs(poles[np.abs(poles.imag) > -poles.real]) / (2 * np.pi)
+    uncertain = np.searchsorted(frequency, modes[~_narrow(sections.band(modes, input))])
+    inside[uncertain[uncertain < len(frequency)]] = False
     return _widest(frequency, inside & excited & ~differs)
 
 

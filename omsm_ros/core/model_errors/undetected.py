@@ -201,15 +201,12 @@ def _worst_relaxation(
 
 
 def fitted_relaxation(dynamics: TransferFunction) -> float:
-    """Return the share of G(0) [1] of real poles that are slower than a structure."""
-    poles = dynamics.poles()
-    found = 0.0
-    for index, pole in enumerate(poles):
-        if pole.imag == 0 and -pole.real * FASTEST_CREEP_S < 1:
-            others = np.delete(poles, index)
-            share = polynomial.polyval(pole, dynamics.numerator) / np.prod(1 - pole / others)
-            found += abs(float(np.real(share)))
-    return found
+    """Return the share of G(0) [1] of slow real poles; one of more than half is a slow probe."""
+    poles, bottom = dynamics.poles(), dynamics.denominator
+    slow = poles[(poles.imag == 0) & (-poles.real * FASTEST_CREEP_S < 1)].real
+    slopes = slow * polynomial.polyval(slow, polynomial.polyder(bottom))
+    shares = np.abs(polynomial.polyval(slow, dynamics.numerator) / slopes)
+    return float(np.sum(shares[shares <= 0.5]))
 
 
 def _hinted_by_data(judged: ScoreTest) -> bool:

@@ -93,6 +93,8 @@ def test_no_order_is_begun_once_enough_was_tried():
         found = explore(fit_structure, order, budget=budget)
         assert max(c.fit.structure.poles for c in found) == order
         assert budget.incomplete
+    again = explore(fit_structure, 0, budget=EvaluationBudget(samples=10**9), least=2)
+    assert max(c.fit.structure.poles for c in again) == 2
     assert max(c.fit.structure.poles for c in explored(PAIR)) > 0
 
 

@@ -9,6 +9,7 @@ from scipy import signal
 from sections_of_polynomials import from_polynomials
 from soaked import soaked
 
+from omsm_ros.core.estimation.parallel_sections import ParallelSections
 from omsm_ros.core.estimation.sampled_fit import SampledRecord
 from omsm_ros.core.identification.sampled_identification import identify_samples, valid_range
 
@@ -84,6 +85,23 @@ def test_the_range_ends_with_the_lines_of_the_input():
     low, high = valid_range(known(1e-10), [block(0.4, 0.6, 0.0)], LINES, 0, np.zeros((0, 400)))
     assert 0.4 <= low < 0.42
     assert 0.58 < high <= 0.6
+
+
+@pytest.mark.parametrize(("standard", "end"), [(1e-4, 4.0), (1.0, 1.0)])
+def test_no_range_contains_a_mode_that_is_known_to_nothing(standard, end):
+    """Narrower than the spacing of lines, between excited ones: no block shows it."""
+    mode = ParallelSections(
+        hold="band-limited",
+        period=0.05,
+        denominators=np.array([[2e-4 / (2 * np.pi), (2 * np.pi) ** -2]]),
+        numerators=np.array([[[1e-3, 0.0]]]),
+        direct=np.ones(1),
+        delays=np.zeros(1),
+        covariance=np.diag([0.0, (1e-3 * standard) ** 2, 0.0, 0.0, 0.0, 0.0]),
+    )
+    found = [block(low, 1.1 * low, 0.0) for low in np.geomspace(0.2, 4.0, 40)]
+    _, high = valid_range(mode, found, LINES, 0, np.zeros((0, 400)))
+    assert high == pytest.approx(end, rel=0.12)
 
 
 @pytest.mark.parametrize("seed", [1, *soaked(2)])
