@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from soaked import soaked
 
@@ -83,6 +84,20 @@ def test_another_sync_left_by_somebody_else_is_set_back(bench: Any) -> None:
     assert len(run.troubles) == 1
     assert "no readable telegram" in run.troubles[0]
     assert run.delivered > 800
+
+
+@pytest.mark.parametrize("trigger", ["free_run", "each"])
+def test_a_counter_in_large_steps_is_counted_and_named(trigger: str, bench: Any) -> None:
+    """As with every twentieth sample sent; telegrams then cannot be told from damaged ones."""
+
+    class EveryTwentieth(ChrocodileEmulator):
+        def pack(self, measured: Any, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
+            return super().pack(measured, counters * 20 % 2**16, times_ns)
+
+    run = bench(EveryTwentieth, ChrocodileDevice, replace(SIX, trigger=trigger))
+    run.run(5.0)
+    assert run.device.counts()["bad_counters"] > 1000
+    assert "counter goes on by 1" in run.troubles[0]
 
 
 @pytest.mark.parametrize("form", ["binary", *soaked("ascii")])

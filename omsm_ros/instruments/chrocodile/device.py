@@ -320,11 +320,13 @@ class Chrocodile(StreamDevice):
     def _listen_in(self, silent: float) -> None:
         """Check that a silent device still has its settings; a free-running one must send."""
         asked = self._check_settings(silent) and silent >= self._wanted.patience
-        if asked and self._wanted.trigger == "free_run":
+        sends = self._monotonic() - self._came_at < self._settings.pause
+        if asked and (sends or self._wanted.trigger == "free_run"):
             self._unheard = True
             raise NoSamplesError(
                 f"{self._transport.name} answers, but sent no readable telegram for "
-                f"{silent:.1f} s; check its trigger, and that no other program changes its settings"
+                f"{silent:.1f} s; check its trigger, that its counter goes on by 1 each sample "
+                "(AVDS 1), and that no other program changes its settings"
             )
 
     def _check_settings(self, waited: float) -> bool:

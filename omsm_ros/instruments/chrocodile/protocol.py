@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.instruments.chrocodile.telegram import (
     FORMATS,
@@ -49,7 +48,7 @@ class BinaryDecoder:
         # Telegrams without a loss between them, of which the first ones are decided, and whether
         # the buffer goes on with the next one; where the counter jumps, that shows they are whole.
         self._row, self._decided, self._joined = b"", 0, False
-        self._received = self._telegrams = self._losses = 0
+        self._received = self._telegrams = self._losses = self._jumps = 0
 
     def reset(self, *, synchronised: bool) -> None:
         """Discard an incomplete telegram; ``synchronised``: the next byte begins one."""
@@ -111,6 +110,7 @@ class BinaryDecoder:
         decoded = self._telegrams * self._layout.length
         waits = len(self._buffer) + len(self._row) - self._decided * self._layout.length
         counts = {"telegrams": self._telegrams, "losses_of_sync": self._losses}
+        counts["bad_counters"] = self._jumps
         return WireCounts(self._received, decoded, waits, **counts)
 
     def _take(self, row: bytes) -> bytes:
@@ -158,6 +158,7 @@ class BinaryDecoder:
             self._synchronised = place + (row + 1) * length <= size
             if self._synchronised:
                 break
+        self._jumps += int(np.sum(fits & (starts < place) & (steps > _NEAR)))
         self._buffer = self._buffer[place:]
         if place and self._joined:
             self._row, self._joined = self._row[:-length], False
@@ -231,9 +232,11 @@ class LineDecoder:
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
-        self._dtype = layout.dtype
         self._line = re.compile(rb"(?: +%s){%d} *\r?" % (_NUMBER_BYTES, len(layout.signals)))
-        self._limits = _limits(layout)
+        kinds = [np.dtype(FORMATS[kind]) for kind in layout.types]
+        self._whole = np.array([kind.kind != "f" for kind in kinds])
+        ranges = [np.iinfo(kind) if kind.kind != "f" else np.finfo(kind) for kind in kinds]
+        self._range = np.array([(float(each.min), float(each.max)) for each in ranges]).T
         self._tail = b""
         self._synchronised = False
         self._received = self._kept = self._telegrams = self._losses = 0
@@ -247,13 +250,11 @@ class LineDecoder:
         """Return telegrams completed by ``data``, shape (n,); n may be 0."""
         self._received += len(data)
         *lines, tail = (self._tail + data).split(b"\n")
-        short = (line for line in lines if len(line) < MAX_TELEGRAM_BYTES)
-        good = [line for line in short if self._line.fullmatch(line) is not None]
+        good = [x for x in lines if len(x) < MAX_TELEGRAM_BYTES and self._line.fullmatch(x)]
         shape = len(good), len(self._layout.signals)
         values = np.fromstring(b" ".join(good), sep=" ").reshape(shape)
-        lowest, highest, whole = self._limits
-        inside = (values >= lowest) & (values <= highest)
-        fits = (inside & (~whole | (values == np.rint(values)))).all(axis=1)
+        inside = (values >= self._range[0]) & (values <= self._range[1])
+        fits = (inside & (~self._whole | (values == np.rint(values)))).all(axis=1)
         values = values[fits]
         if lines:
             # The bytes before the first end of a line may be a part of a line.
@@ -270,21 +271,13 @@ class LineDecoder:
 
     def settle(self) -> Records:
         """Return no telegram, shape (0,): a line has its own end."""
-        return np.empty(0, self._dtype)
+        return self._layout.records(0)
 
     @property
     def statistics(self) -> WireCounts:
         """Return the counts of bytes, telegrams, and damaged lines."""
         counts = {"telegrams": self._telegrams, "losses_of_sync": self._losses}
         return WireCounts(self._received, self._kept, len(self._tail), **counts)
-
-
-def _limits(layout: Layout) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Return each signal's least and greatest value (signals,), and whether it is whole."""
-    kinds = [np.dtype(FORMATS[kind]) for kind in layout.types]
-    ranges = [np.finfo(kind) if kind.kind == "f" else np.iinfo(kind) for kind in kinds]
-    lowest, highest = ([float(getattr(r, end)) for r in ranges] for end in ("min", "max"))
-    return np.array(lowest), np.array(highest), np.array([kind.kind != "f" for kind in kinds])
 
 
 READY = b"ready\r\n"
