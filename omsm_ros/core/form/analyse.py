@@ -256,15 +256,19 @@ def _figures(
     }
     for k, name in enumerate(("", "_best_fit", "_without_second_order")):
         figures |= {f"peak_to_valley{name}": extents[k][0], f"rms{name}": sizes[k]}
-    points = smooth.without(FORM)
+    # What an even grid shows is texture, for it was measured once.
+    points = replace(smooth.without(FORM), noise_known=map_.noise_known and not even)
     formless = GridCells.of(points, even=even)
     # Without an S-filter the surface has waves that the cells do not resolve.
     if cells.width == 0 or bands.s_filter is not None:
         return figures, texture.texture(cells, formless, bands, None, rest_cells)
     points = short_waves(points, formless, bands.l_filter)
     textures = texture.texture(cells, formless, bands, points, rest_cells, gathered.gradient)
-    gaps = None if even else gaps
-    whole = extents_of_parts([points], smooth.disc, gaps, missed)[0][0]
+    if even:
+        height, more = textures["Sz"], sum(missed)
+        doubt = length(height.uncertainty or 0.0, more)
+        return figures, textures | {"Sz": UncertainValue((height.value or 0.0) + more, doubt)}
+    whole = extents_of_parts([points], smooth.disc, gaps)[0][0]
     return figures, textures | {"Sq": _rms_to_rim(points, gaps), "Sz": whole}
 
 
@@ -301,11 +305,10 @@ class _Gathered:
         dust = whole.part(usable & ~good)
         self._dust.append(np.stack([dust.x, dust.y, dust.deviation]))
         if np.any(good):
-            points = whole.part(good)
-            self._keep(points, portion.systematic[:, good])
+            self._keep(whole.part(good), portion.systematic[:, good])
             if self.even:
-                places = portion.x[good], portion.y[good]
-                self._grid.append(np.array([*places, points.deviation], np.float32))
+                rows = portion.x[good], portion.y[good], whole.deviation[good]
+                self._grid.append(np.array(rows, np.float32))
 
     def _keep(self, points: Placed, systematic: FloatArray) -> None:
         self.least = min(self.least, float(points.deviation.min()))

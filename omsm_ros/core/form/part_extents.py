@@ -63,23 +63,22 @@ _TINY = 1e-40
 
 def extents_of_parts(
     maps: Sequence[DeviationMap], disc: Aperture, gaps: Gaps | None = None,
-    further: tuple[float, float] = (0.0, 0.0),
+    past: tuple[float, float] = (0.0, 0.0),
 ) -> list[tuple[UncertainValue, UncertainValue]]:  # fmt: skip
     """Return the peak to valley of maps that differ by smooth form.
 
     Second is the extent of 99.5 % of the area, of the first map only.
 
     disc: of the smooth terms;  gaps: between the points of the maps, None without any
-    further: how far points that no map holds reach below and above all others [m]
+    past: how far points that no map holds reach below and above all others [m]
     """
     if not maps[0].noise_known:
         ways = zip(*map(with_and_without, maps), strict=True)
-        one, other = (extents_of_parts(way, disc, gaps, further) for way in ways)
+        one, other = (extents_of_parts(way, disc, gaps, past) for way in ways)
         return [(either(a[0], b[0]), either(a[1], b[1])) for a, b in zip(one, other, strict=True)]
     form = _PartForm.of(maps[0], disc)
     shifts = (map_.deviation - maps[0].deviation for map_ in maps)
-    return [form.extents(m, s, gaps, m is maps[0], further)
-            for m, s in zip(maps, shifts, strict=True)]  # fmt: skip
+    return [form.extents(m, s, gaps, m is maps[0], past) for m, s in zip(maps, shifts, strict=True)]
 
 
 class _PartForm(NamedTuple):
@@ -125,7 +124,7 @@ class _PartForm(NamedTuple):
 
     def extents(
         self, map_: DeviationMap, shift: FloatArray, gaps: Gaps | None, robust: bool,
-        further: tuple[float, float],
+        past: tuple[float, float],
     ) -> tuple[UncertainValue, UncertainValue]:  # fmt: skip
         """Return the extents of the ``map_`` whose form differs by a smooth ``shift`` (n,) [m]."""
         form = self.value + shift
@@ -160,7 +159,7 @@ class _PartForm(NamedTuple):
             of_blur = 2 * of_some * np.sqrt(2) * self.blurred
             of_all = length(of_errors, of_bounds, of_taken, of_blur, 2 * float(of_some) * open_)
             figure = of_square(square, of_all)
-            between = np.maximum(np.maximum(beyond, of_waves), further)
+            between = np.maximum(np.maximum(beyond, of_waves), past)
             between = np.append(between, -alone) / 2 * (all_ is form)
             value = (figure.value or 0.0) + _extents(all_, ends) - of_some + float(np.sum(between))
             of_gaps = length(*between, *of_rim * (all_ is form))

@@ -123,8 +123,8 @@ def test_a_profile_has_the_figures_of_its_line(turned):
         assert found["slope_rms"].value == pytest.approx(both, rel=0.01)
 
 
-def test_points_that_the_map_does_not_hold_count_in_gradient_and_peak_to_valley(monkeypatch):
-    """White texture of 160 × 160 points in blocks of nine, every fourth one in the map."""
+def test_a_map_that_cells_and_selection_do_not_hold_keeps_its_texture(monkeypatch):
+    """White texture and a pit: 160 × 160 points in blocks of nine, every fourth one selected."""
     monkeypatch.setattr(deviation_map, "_MOST_OF_GRID", 64)
     monkeypatch.setattr(analyse, "MOST_WEIGHED", 2**13)
     step, size = 1e-5, 10e-9
@@ -136,5 +136,6 @@ def test_points_that_the_map_does_not_hold_count_in_gradient_and_peak_to_valley(
     true = np.sqrt(sum(np.mean(np.diff(height, axis=k) ** 2) for k in (0, 1))) / step
     assert true == pytest.approx(2 * size / step, rel=0.1)
     assert found["Sdq"].value == pytest.approx(true, rel=5e-3)
-    whole = found["peak_to_valley"]
-    assert abs(whole.value - np.ptp(height)) < 2 * whole.uncertainty < np.ptp(height)
+    assert found["Sq"].value == pytest.approx(size, rel=0.03)
+    for whole in (found["peak_to_valley"], found["Sz"]):
+        assert abs(whole.value - np.ptp(height)) < 2 * whole.uncertainty < 2 * np.ptp(height)
