@@ -308,9 +308,10 @@ class PandaBox:
                 raise self._unreadable(err) from err
             for _, answer in self._talk.responses():
                 if isinstance(answer, Exception):
+                    said = " ".join(str(answer).split()).rpartition("AssertionError: ")[2]
                     raise DeviceError(
-                        f"{self.name} refused a command: {' '.join(str(answer).split())}; check "
-                        "the names of the fields in the address, and other clients of the box"
+                        f"{self.name} refused a command: {said}; check the names of the fields in "
+                        "the address, and other clients of the box"
                     )
                 return answer
         raise DeviceTimeoutError(
