@@ -17,11 +17,13 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.interface_inputs import Calibration, bounded, load
 from omsm_ros.interface_inputs import read as read
@@ -53,10 +55,6 @@ from omsm_ros.quantities import (
     UNCERTAINTY,
     shown,
 )
-
-if TYPE_CHECKING:
-    from omsm_ros.core.kinematics.kinematics import Surface
-    from omsm_ros.core.surface.aperture import Aperture
 
 
 def _checked(value: Any, kind: type) -> Any:

@@ -46,7 +46,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.streams.statistics import EvenSelection, noise_of
 from omsm_ros.core.surface.aperture import Aperture, best_covered, within_aperture
 from omsm_ros.core.surface.area_weights import LINE_WIDTH, area_weights
-from omsm_ros.core.surface.height_grid import as_grid
+from omsm_ros.core.surface.height_grid import HeightGrid, as_grid
 from omsm_ros.core.surface.measured_points import measured
 from omsm_ros.core.surface.zernike_terms import (
     ZernikeIndex,
@@ -263,7 +263,7 @@ def _figures(
     if cells.width == 0 or bands.s_filter is not None:
         return figures, texture.texture(cells, formless, bands, None, rest_cells)
     points = short_waves(points, formless, bands.l_filter)
-    textures = texture.texture(cells, formless, bands, points, rest_cells, gathered.gradient)
+    textures = texture.texture(cells, formless, bands, points, rest_cells, gathered.grid)
     if even:
         height, more = textures["Sz"], sum(missed)
         doubt = length(height.uncertainty or 0.0, more)
@@ -327,13 +327,9 @@ class _Gathered:
         return of_grid * float(kept.min() - self.least), of_grid * float(self.most - kept.max())
 
     @property
-    def gradient(self) -> float | None:
-        """The rms gradient between all neighbours of a grid [1]; None without one."""
-        grid = as_grid(measured(*np.concatenate(self._grid, axis=1))) if self._grid else None
-        if grid is None:
-            return None
-        slopes = (np.diff(grid.height, axis=k) / step for k, step in ((1, grid.dx), (0, grid.dy)))
-        return float(np.sqrt(sum(np.nanmean(along**2) for along in slopes)))
+    def grid(self) -> HeightGrid | None:
+        """The deviations of all points of a grid; None without one."""
+        return as_grid(measured(*np.concatenate(self._grid, axis=1))) if self._grid else None
 
     @property
     def dust(self) -> FloatArray:

@@ -167,6 +167,8 @@ _ALPHA = float(np.sqrt(np.log(2) / np.pi))
 _CUTOFF_OF_MEAN = float(np.pi / np.sqrt(6 * np.log(2)))
 # Steps between columns of a grid are a larger share of the widest, and its places that filled.
 _LEAST_STEP, _LEAST_FILLED = 0.05, 0.2
+# Points of a grid that determine its form of fourth order.
+_MOST_FITTED = 20_000
 # Reach of a Gaussian over its cutoff, where it is 1e-8.
 _REACH = 1.15
 # Share of the weight that keeps the slopes of a lone cell at zero.
@@ -340,6 +342,17 @@ def _of_grid(x: FloatArray, y: FloatArray) -> tuple[tuple[float, float], float] 
         return None
     block = int(np.ceil(np.sqrt(np.prod(counts)) / _MOST_OF_GRID))
     return (spacings[0] * block, spacings[1] * block), 0.5 / block
+
+
+def square_slope(height: FloatArray, steps: tuple[float, float]) -> float:
+    """Return the mean square slope of a map (r, c) [m] beyond its form of fourth order."""
+    y, x = (np.linspace(-1.0, 1.0, size) for size in height.shape)
+    row, column = (at[:: -(-len(at) // _MOST_FITTED)] for at in np.nonzero(np.isfinite(height)))
+    columns = np.polynomial.polynomial.polyvander2d(y[row], x[column], (4, 4))
+    form = np.linalg.lstsq(columns, height[row, column])[0].reshape(5, 5)
+    rest = height - np.polynomial.polynomial.polygrid2d(y, x, form)
+    ways = zip((1, 0), steps, strict=True)
+    return float(sum(np.nanmean(np.diff(rest, axis=axis) ** 2) / step**2 for axis, step in ways))
 
 
 def gaussian_weights(size: int, cutoff: float) -> FloatArray:

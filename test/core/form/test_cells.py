@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from omsm_ros.core.form import deviation_map
 from omsm_ros.core.form.deviation_map import DeviationMap, GridCells, profile_noise, repeated_noise
 from omsm_ros.core.form.part_figures import short_waves
 from omsm_ros.core.form.texture import bands_of, power_density, texture
+from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import DataError
 
 SIDE = 20e-3
@@ -243,3 +245,21 @@ def test_a_grid_of_512_columns_has_as_many_cells(step):
         x=x, y=y, deviation=x, area=np.ones(len(x)), effects=np.empty((0, len(x))), noise=0.0
     )
     assert GridCells.of(map_, even=True).mean.shape == (512, 512)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-5])
+def test_blocks_lose_no_gradient_of_a_fine_texture_on_a_large_form(monkeypatch, size):
+    """White texture of 1 nm in blocks of four points; astigmatism and a cubic term of 10 µm."""
+    monkeypatch.setattr(deviation_map, "_MOST_OF_GRID", 64)
+    map_ = square(lambda x, y: 0 * x, noise=1e-9, points=128)
+    fine = map_.deviation.reshape(128, 128)
+    v, u = (np.indices((128, 128)) - 63.5) / 64
+    seen = fine + size * (u**2 - v**2 + 0.3 * u**3)
+    step = SIDE / 127
+    grid = HeightGrid(height=seen, x0=0.0, y0=0.0, dx=step, dy=step)
+    cells, formless = (
+        GridCells.of(replace(map_, deviation=values.ravel()), even=True) for values in (seen, fine)
+    )
+    found = texture(cells, formless, bands_of(cells, None, 1.0), map_, None, grid)["Sdq"]
+    true = np.sqrt(sum(np.mean(np.diff(fine, axis=k) ** 2) for k in (0, 1))) / step
+    assert found.value == pytest.approx(true, rel=5e-3)
