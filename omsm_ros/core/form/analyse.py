@@ -19,6 +19,7 @@ from omsm_ros.core.form.deviation_map import (
     path_noise,
     profile_noise,
     repeated_noise,
+    square_slope,
 )
 from omsm_ros.core.form.part_extents import extents_of_parts
 from omsm_ros.core.form.part_figures import (
@@ -46,8 +47,8 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.streams.statistics import EvenSelection, noise_of
 from omsm_ros.core.surface.aperture import Aperture, best_covered, within_aperture
 from omsm_ros.core.surface.area_weights import LINE_WIDTH, area_weights
-from omsm_ros.core.surface.height_grid import HeightGrid, as_grid
-from omsm_ros.core.surface.measured_points import measured
+from omsm_ros.core.surface.height_grid import as_grid
+from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.core.surface.zernike_terms import (
     ZernikeIndex,
     first_terms,
@@ -210,6 +211,7 @@ def analyse_form(
     for portion in portions():
         for part in portion.chunks(CHUNK):
             gathered.add(part)
+    slope = gathered.square_slope() if even and gathered.counts["used"] else None
     held = range(len(sources), found.moved.shape[1])  # Their offsets are upper bounds, too.
     x, y = places = gathered.places
     uncovered, outline = best_covered(x, y, found.spacing, aperture or found.disc, aperture is None)
@@ -227,7 +229,7 @@ def analyse_form(
     of_rim, guess = None if outline.outline == "annulus" else strip, aperture is None
     gaps = Gaps.of(map_, outline, found.spacing, of_rim, guessed=guess, uncovered=uncovered)
     del strip, of_rim  # it is as large as the map
-    figures, textures = _figures(smooth, zernike, cells, bands, outline, gaps, gathered)
+    figures, textures = _figures(smooth, zernike, cells, bands, outline, gaps, gathered, slope)
     return FormResult(
         registration=found, aperture=outline, map=map_, zernike=zernike, bands=bands,
         deviation=figures | gathered.as_measured(map_) | textures,
@@ -238,7 +240,7 @@ def analyse_form(
 
 def _figures(
     smooth: SmoothTerms, zernike: ZernikeFit, cells: GridCells, bands: texture.Bands,
-    outline: Aperture, gaps: Gaps | None, gathered: _Gathered,
+    outline: Aperture, gaps: Gaps | None, gathered: _Gathered, slope: float | None,
 ) -> tuple[dict[str, UncertainValue], dict[str, UncertainValue]]:  # fmt: skip
     """Return figures of the map, and its texture with slopes;  cells: of it."""
     even, missed = gathered.even, gathered.missed
@@ -263,7 +265,7 @@ def _figures(
     if cells.width == 0 or bands.s_filter is not None:
         return figures, texture.texture(cells, formless, bands, None, rest_cells)
     points = short_waves(points, formless, bands.l_filter)
-    textures = texture.texture(cells, formless, bands, points, rest_cells, gathered.grid)
+    textures = texture.texture(cells, formless, bands, points, rest_cells, slope)
     if even:
         height, more = textures["Sz"], sum(missed)
         doubt = length(height.uncertainty or 0.0, more)
@@ -326,10 +328,11 @@ class _Gathered:
         kept, of_grid = self._kept.rows()[:, 2], float(self.even)
         return of_grid * float(kept.min() - self.least), of_grid * float(self.most - kept.max())
 
-    @property
-    def grid(self) -> HeightGrid | None:
-        """The deviations of all points of a grid; None without one."""
-        return as_grid(measured(*np.concatenate(self._grid, axis=1))) if self._grid else None
+    def square_slope(self) -> float | None:
+        """Return the mean square slope between the points of a grid [1], and let go of them."""
+        rows, self._grid = np.concatenate(self._grid, axis=1), []
+        grid = as_grid(MeasuredPoints(x=rows[0], y=rows[1], height=rows[2]))
+        return None if grid is None else square_slope(grid.height, (grid.dx, grid.dy))
 
     @property
     def dust(self) -> FloatArray:

@@ -19,7 +19,6 @@ from omsm_ros.core.form.part_figures import of_square
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.deviation import Profile, line_profile, radial_profile
-from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import DataError
 
 # A fixed seed, so that the same points give the same figures.
@@ -138,14 +137,14 @@ class _FilteredBand:
 
 def texture(
     cells: GridCells, formless: GridCells, bands: Bands, points: DeviationMap | None = None,
-    rest: GridCells | None = None, grid: HeightGrid | None = None,
+    rest: GridCells | None = None, slope: float | None = None,
 ) -> dict[str, UncertainValue]:  # fmt: skip
     """Return Sa, Sq, Sz [m], Ssk, Sku, Sdq [1] of the S-L surface, rms by band [m], slopes [1].
 
     formless: the same cells after the F-operation
     points: the S-L surface, None for that of the cells
     rest: the same cells without their second order, whose slope is found too
-    grid: all points, of which the cells hold blocks
+    slope: mean square between all points of a grid [1], of which the cells hold blocks
     """
     shown = [cells] if rest is None else [cells, rest]
     images = [np.concatenate([c.mean[np.newaxis], c.effects]) for c in shown]
@@ -155,11 +154,10 @@ def texture(
     surface = _band(formless, *between, levels) if points is None else _of_points(points)
     found = dict(zip(("Sa", "Sq", "Sz", "Ssk", "Sku"), surface.figures(_moments, 3), strict=True))
     blocks, lost = formless, 0.0
-    if grid is not None:
+    if slope is not None:
         # Blocks hold what the filters remove, and lose short waves.
         held = square_slope(np.where(cells.present, cells.mean, np.nan), cells.steps)
-        lost = max(square_slope(grid.height, (grid.dx, grid.dy)) - held, 0.0)
-        blocks = replace(formless, width=0.0)
+        blocks, lost = replace(formless, width=0.0), max(slope - held, 0.0)
     pairs = _band(blocks, *between, levels, between=True)
     found["Sdq"] = UncertainValue(None, None)
     if pairs.levels[0].size:

@@ -9,7 +9,6 @@ from omsm_ros.core.form import deviation_map
 from omsm_ros.core.form.deviation_map import DeviationMap, GridCells, profile_noise, repeated_noise
 from omsm_ros.core.form.part_figures import short_waves
 from omsm_ros.core.form.texture import bands_of, power_density, texture
-from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import DataError
 
 SIDE = 20e-3
@@ -256,10 +255,10 @@ def test_blocks_lose_no_gradient_of_a_fine_texture_on_a_large_form(monkeypatch, 
     v, u = (np.indices((128, 128)) - 63.5) / 64
     seen = fine + size * (u**2 - v**2 + 0.3 * u**3)
     step = SIDE / 127
-    grid = HeightGrid(height=seen, x0=0.0, y0=0.0, dx=step, dy=step)
+    slope = deviation_map.square_slope(seen, (step, step))
     cells, formless = (
         GridCells.of(replace(map_, deviation=values.ravel()), even=True) for values in (seen, fine)
     )
-    found = texture(cells, formless, bands_of(cells, None, 1.0), map_, None, grid)["Sdq"]
+    found = texture(cells, formless, bands_of(cells, None, 1.0), map_, None, slope)["Sdq"]
     true = np.sqrt(sum(np.mean(np.diff(fine, axis=k) ** 2) for k in (0, 1))) / step
     assert found.value == pytest.approx(true, rel=5e-3)
