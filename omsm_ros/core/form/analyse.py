@@ -258,7 +258,7 @@ def _figures(
     }
     for k, name in enumerate(("", "_best_fit", "_without_second_order")):
         figures |= {f"peak_to_valley{name}": extents[k][0], f"rms{name}": sizes[k]}
-    # What an even grid shows is texture, for it was measured once.
+    # An even grid was measured once: its scatter counts as texture.
     points = replace(smooth.without(FORM), noise_known=map_.noise_known and not even)
     formless = GridCells.of(points, even=even)
     # Without an S-filter the surface has waves that the cells do not resolve.
