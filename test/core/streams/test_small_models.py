@@ -282,7 +282,7 @@ class TestLately:
     @few
     @given(st.lists(st.tuples(st.floats(0.1, 6.0), st.integers(0, 5)), min_size=1, max_size=25))
     def test_an_increase_is_that_since_the_look_before_the_window(self, looks):
-        recent, now, value, seen = RecentIncrease(window=10.0), 0.0, 0, []
+        recent, now, value, seen = RecentIncrease(), 0.0, 0, []
         for after, more in looks:
             now += after
             value += more
@@ -295,7 +295,7 @@ class TestLately:
     @few
     @given(st.lists(st.tuples(st.floats(0.1, 4.0), st.integers(0, 5)), min_size=2, max_size=25))
     def test_silence_and_rate_are_those_of_the_looks(self, looks):
-        flow, now, samples, seen, last = SampleFlow(window=10.0), 0.0, 0, [], None
+        flow, now, samples, seen, last = SampleFlow(), 0.0, 0, [], None
         for after, more in looks:
             now += after
             samples += more
