@@ -351,8 +351,8 @@ def square_slope(height: FloatArray, steps: tuple[float, float]) -> float:
     columns = np.polynomial.polynomial.polyvander2d(y[row], x[column], (4, 4))
     form = np.linalg.lstsq(columns, height[row, column])[0].reshape(5, 5)
     rest = height - np.polynomial.polynomial.polygrid2d(y, x, form)
-    ways = zip((1, 0), steps, strict=True)
-    return float(sum(np.nanmean(np.diff(rest, axis=axis) ** 2) / step**2 for axis, step in ways))
+    slopes = [np.diff(rest, axis=axis) / step for axis, step in zip((1, 0), steps, strict=True)]
+    return float(sum(np.nansum(s**2) / max(np.isfinite(s).sum(), 1) for s in slopes))
 
 
 def gaussian_weights(size: int, cutoff: float) -> FloatArray:
