@@ -109,9 +109,8 @@ class BinaryDecoder:
         """Return the counts of bytes, telegrams, and losses of synchronisation."""
         decoded = self._telegrams * self._layout.length
         waits = len(self._buffer) + len(self._row) - self._decided * self._layout.length
-        counts = {"telegrams": self._telegrams, "losses_of_sync": self._losses}
-        counts["bad_counters"] = self._jumps
-        return WireCounts(self._received, decoded, waits, **counts)
+        counts = {"telegrams": self._telegrams, "bad_counters": self._jumps}
+        return WireCounts(self._received, decoded, waits, losses_of_sync=self._losses, **counts)
 
     def _take(self, row: bytes) -> bytes:
         """Return telegrams up to the last one that is followed by another, or to a missing sync.
@@ -199,8 +198,10 @@ class _Counter:
             return np.full(count, steps.max(initial=0) <= most)
         even = (steps[1:] == steps[:-1]) & (steps[1:] <= _NEAR)
         good = np.convolve(even, np.ones(_ROW)) > 0
-        near = np.convolve((steps >= 1) & (steps <= _NEAR), np.ones(4), "valid") == 4
-        # Small steps suffice where a line loses samples all the time, but not between two rows.
+        each = raw[: count * self._length].reshape(count, self._length)
+        small = (steps <= _NEAR) & ((steps > 0) | (each[1:] == each[:-1]).all(axis=1))
+        near = np.convolve(small, np.ones(4), "valid") == 4
+        # Small steps suffice where a line loses or repeats samples, but not between two rows.
         good[2:-2] |= near[: max(0, count - 4)] & ~(good[1:-3] & good[3:-1])
         return good
 
