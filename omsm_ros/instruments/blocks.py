@@ -3,14 +3,14 @@
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, IntArray
 from omsm_ros.instruments.arrivals import DeviceClock, MissedTriggerDetector
-from omsm_ros.instruments.counting import SAMPLE, CountedRun, Samples, Turns
-from omsm_ros.instruments.scaling import AXES, AxisScaling
+from omsm_ros.instruments.counting import SAMPLE, CountedRun, Samples
+from omsm_ros.instruments.scaling import AXES, AxisScaling, Turns
 from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S, PPM
 
 # A time that differs from those of its run by more was damaged on the line [ns].
@@ -320,24 +320,18 @@ class BlockCutter:
         self._evenly_wrong = bool(off.min() > limit or off.max() < -limit)
 
     def _blocks(self, samples: Samples, first: int, stamp: int) -> BlockPair:
-        common = {
-            "stamp_ns": stamp,
-            "first_sample": first,
-            "sample_period": self._settings.sample_period,
-        }
+        period = self._settings.sample_period
+        common: Any = {"stamp_ns": stamp, "first_sample": first, "sample_period": period}
         axes = distance = None
         if (scaling := self._channels.axes) is not None:
             counts = samples["counts"].T[: len(scaling)]
             turned = [turns.continued(c) for turns, c in zip(self._turns, counts, strict=True)]
             columns = zip(AXES, scaling, turned, strict=True)
-            positions = {name: axis.values(column) for name, axis, column in columns}
-            axes = AxisBlock(**common, **positions)  # type: ignore[arg-type]
+            positions: Any = {name: axis.values(column) for name, axis, column in columns}
+            axes = AxisBlock(**common, **positions)
         if self._channels.distance:
             reported = not np.isnan(samples["intensity"]).all()
-            distance = DistanceBlock(
-                **common,  # type: ignore[arg-type]
-                distance=samples["distance"],
-                status=samples["status"],
-                intensity=samples["intensity"] if reported else np.empty(0, np.float32),
-            )
+            intensity = samples["intensity"] if reported else np.empty(0, np.float32)
+            channels: Any = {"distance": samples["distance"], "status": samples["status"]}
+            distance = DistanceBlock(**common, **channels, intensity=intensity)
         return BlockPair(axes, distance)

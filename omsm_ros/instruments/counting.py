@@ -1,17 +1,18 @@
-"""Converts device counters that wrap into one trigger count, and adds turns of encoders."""
+"""Converts device counters that wrap into one trigger count, and detects missed triggers."""
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.streams.blocks import IntArray
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.units import NANOSECOND_S
 
 SAMPLE = np.dtype(
@@ -146,6 +147,9 @@ class PacketFinder:
 
 # Arrivals are uneven, so a gap and the time that passed may differ by this much [s].
 _SLACK_S = 0.5
+# Least number of steps of time whose scatter is known, and the largest scatter of a step over
+# missed triggers that still shows their number [period].
+_STEPS, _UNCLEAR = 32, 0.25
 # Copies of samples that were sent before are recognised this far back.
 _RECENT_SAMPLES = 1024
 
@@ -185,12 +189,18 @@ class SequenceTracker:
 
     A repeated sample or number is a duplicate. A counter or time that falls back, or a counter at
     zero after a silence, is a restart of the device; its own number counts from there. Any other
-    number that is not the next one is a gap.
+    number that is not the next one is a gap, and so are triggers that the time shows as missed.
     """
 
-    def __init__(self, counting: Counting) -> None:
+    def __init__(self, counting: Counting, period: float = math.inf, pause: float = 0.0) -> None:
+        """period: of a trigger, so that times show which ones were missed;  pause: of it [s]."""
         self.duplicates = self.lost = self.gaps = self.restarts = self.spoilt = 0
+        self.missed_by_time = 0
         self._counting = counting
+        watched = counting.timed and not counting.period
+        self._trigger = period / NANOSECOND_S if watched else math.inf  # period [ns]
+        self._most = pause / NANOSECOND_S / 2 / self._trigger  # missed triggers in a row
+        self._uneven = np.empty(0)  # deviations of the latest steps of time from a period, (n,)
         self._raw = self._time = self._counter = 0
         self._begun = self._anew = False
         self._held = np.empty(0, SAMPLE)
@@ -217,10 +227,10 @@ class SequenceTracker:
         samples, self._held = np.concatenate([self._held, samples]), np.empty(0, SAMPLE)
         pause = _StreamBreak(elapsed, broken)
         while len(samples):
-            count = 0 if broken or self._anew else self._in_order(samples)
+            count, one = 0 if broken or self._anew else self._in_order(samples), len(samples) == 1
             if count:
                 yield self._accept(samples[:count], self._counter + 1, False)
-            elif len(samples) == 1 and self._counter_jumps(samples[0]):
+            elif one and (self._counter_jumps(samples[0]) or self._missed(samples)[0]):
                 self._held = samples.copy()
                 return
             else:
@@ -238,15 +248,38 @@ class SequenceTracker:
         """Return how many samples at the beginning have consecutive counters."""
         if not self._begun:
             return 0
+        if self._trigger < math.inf and len(self._uneven) < _STEPS:
+            samples = samples[:_STEPS]  # their scatter judges the next ones
         steps = np.diff(samples["counter"], prepend=self._raw) % self._counting.modulus
         good = steps == 1
         if self._counting.timed:
             # A time that falls back while the counter goes on is a spoilt time.
             restarts = samples["counter"] == 0 if not self._counting.checked else True
             good &= ~((np.diff(samples["time"], prepend=self._time) < 0) & restarts)
+            good &= self._missed(samples) == 0
         return len(good) if good.all() else int(np.argmin(good))
 
+    def _missed(self, samples: Samples) -> IntArray:
+        """Return the triggers missed before each of ``samples`` (n,), as its time shows.
+
+        A damaged time falls back with the next sample; a longer step is a pause.
+        """
+        beyond = self._beyond(samples)
+        missed = np.rint(beyond)
+        unclear = (2 + missed) * self._uneven.max(initial=0.0) + 2 / self._trigger
+        good = (abs(beyond - missed) <= unclear) & (unclear < _UNCLEAR)
+        good &= (missed > 0) & (missed <= self._most) & np.append(beyond[1:] > -0.5, True)
+        return np.where(good & (len(self._uneven) >= _STEPS), missed, 0).astype(np.int64)
+
+    def _beyond(self, samples: Samples) -> FloatArray:
+        """Return the periods of time before each of ``samples`` (n,) that were not counted."""
+        counted = np.diff(samples["counter"], prepend=self._raw) % self._counting.modulus
+        return np.asarray(np.diff(samples["time"], prepend=self._time) / self._trigger - counted)
+
     def _accept(self, samples: Samples, first: int, restarted: bool) -> CountedRun:
+        if self._begun and first == self._counter + 1:
+            uneven = abs(self._beyond(samples))
+            self._uneven = np.append(self._uneven, uneven[uneven <= self._most])[-_RECENT_SAMPLES:]
         self._begun, self._anew = True, False
         self._raw, self._time = int(samples["counter"][-1]), int(samples["time"][-1])
         self._counter = first + len(samples) - 1
@@ -279,12 +312,11 @@ class SequenceTracker:
         advance = 0 if step == 1 and spoilt_time else advance
         if self._counting.timed:  # the device's own clock, not arrivals, which the host may delay
             pause = _StreamBreak(max(advance, 0) * NANOSECOND_S, pause.broken)
-        in_order = step == 1 and advance >= 0
         # After a restart, samples without time may equal earlier ones by chance.
-        may_repeat = self._counting.timed or not pause.broken
+        may_repeat = (self._counting.timed or not pause.broken) and not self._anew
         if self._is_corrupted_counter(samples):
             self.spoilt += 1
-        elif may_repeat and not (in_order or self._anew) and self._is_repeated(sample):
+        elif may_repeat and (step != 1 or advance < 0) and self._is_repeated(sample):
             self.duplicates += 1
         elif self._anew or self._counter_fell_back(raw, step, advance, pause):
             self.restarts += 1
@@ -293,9 +325,10 @@ class SequenceTracker:
             self.duplicates += 1
             self._time += advance
         else:
+            self.missed_by_time += (missed := int(self._missed(samples[:2])[0]))
             self.lost += step - 1
             self.gaps += step > 1
-            yield self._accept(alone, self._counter + step, False)
+            yield self._accept(alone, self._counter + step + missed, False)
 
     def _is_repeated(self, sample: np.void) -> bool:
         previous = self._recent[int(sample["counter"]) % _RECENT_SAMPLES]
@@ -327,77 +360,6 @@ class SequenceTracker:
 class _StreamBreak(NamedTuple):
     elapsed: float = 0.0
     broken: bool = False
-
-
-# No axis changes its step by more than this from one sample to the next [turn].
-_LITTLE = 1 / 64
-# After this many nearly equal steps the position is accepted; counts spoilt by noise give such a
-# row by chance once in 10⁹.
-_ALIKE = 6
-
-_Steps = TypeVar("_Steps", IntArray, int)
-
-
-class Turns:
-    """Adds the whole turns to counts that start again at zero after ``wrap``; 0 = never.
-
-    The axis moves less than half a turn between two samples, so a step is the shorter way round.
-    Two steps to a count spoilt by noise and back may add up to a whole turn. So the count before a
-    jump is kept, and later counts get the turns that bring them next to it.
-    """
-
-    def __init__(self, wrap: int) -> None:
-        self._wrap = wrap
-        self._last = self._step = 0
-        self._seen = 0  # samples since the first one that was accepted
-        self._kept: int | None = None  # the count before a jump
-        self._since = self._alike = 0
-
-    def continued(self, counts: IntArray) -> IntArray:
-        """Return the counts (n,) with their whole turns, from the first count on."""
-        if not self._wrap:
-            return counts
-        if self._seen > _ALIKE and self._kept is None:
-            steps = self._shorter(np.diff(counts, prepend=self._last))
-            before = np.concatenate([[self._step], steps[:-1]])
-            if np.all(np.abs(steps - before) <= _LITTLE * self._wrap):
-                turned: IntArray = self._last + np.cumsum(steps)
-                if len(turned):
-                    self._last, self._step = int(turned[-1]), int(steps[-1])
-                return turned
-        return np.array([self._next(int(count)) for count in counts], dtype=np.int64)
-
-    def _next(self, count: int) -> int:
-        step = self._shorter(count - self._last)
-        value = self._last + step
-        differs = abs(step - self._step) > _LITTLE * self._wrap
-        if self._kept is not None:
-            value, step = self._follow_jump(value, step, differs)
-        elif self._seen <= _ALIKE:
-            if self._seen == 0 or (self._seen > 1 and differs):  # the one before was spoilt
-                value, step, self._seen = count, 0, 0
-            self._seen += 1
-        elif differs:
-            self._kept, self._since, self._alike = self._last, 0, 0
-        self._last, self._step = value, step
-        return value
-
-    def _follow_jump(self, value: int, step: int, differs: bool) -> tuple[int, int]:
-        assert self._kept is not None
-        self._since += 1
-        self._alike = 0 if differs else self._alike + 1
-        off = self._shorter(value - self._kept)
-        if abs(off) <= _LITTLE * self._wrap:
-            value, step, self._kept = self._kept + off, 0, None
-        elif self._alike >= _ALIKE:
-            if self._alike < self._since - 1:  # else it moved there in a gap
-                value = self._kept + off
-            self._kept = None
-        return value, step
-
-    def _shorter(self, steps: _Steps) -> _Steps:
-        half = self._wrap // 2
-        return (steps + half) % self._wrap - half
 
 
 # Relative difference below which successive steps are equal, the number of equal steps that is not

@@ -229,8 +229,9 @@ class Instrument:
 
     def _spoil(self, packed: list[bytes]) -> list[bytes]:
         pieces, faults = list[bytes](), self.faults
-        rates = faults.drop_rate, faults.noise_rate, faults.flip_rate
-        struck = [self._struck(rate, len(packed)) for rate in rates]
+        rates, n = (faults.drop_rate, faults.noise_rate, faults.flip_rate), len(packed)
+        # No random number is used without a fault, so each fault alone repeats with its seed.
+        struck = [self._random.random(n) < rate if rate else np.zeros(n, bool) for rate in rates]
         for piece, dropped, noisy, flipped in zip(packed, *struck, strict=True):
             if piece and dropped:
                 continue
@@ -242,10 +243,6 @@ class Instrument:
                 piece = self._random.bytes(_NOISE_BYTES) + piece
             pieces.append(piece)
         return pieces
-
-    def _struck(self, rate: float, count: int) -> NDArray[np.bool_]:
-        # No random number is used without a fault, so each fault alone repeats with its seed.
-        return self._random.random(count) < rate if rate else np.zeros(count, np.bool_)
 
     def say(self, wire: bytes) -> None:
         """Send an answer."""

@@ -42,7 +42,7 @@ held: waiting for their successor;  spoilt: with a counter that jumped ahead and
 duplicates: received twice
 withheld: kept back because the device runs at another rate than it was set to, its encoders
     lost their positions, or no arrival confirms that it missed no trigger before them
-missed: triggers without a sample of this device, by the arrivals (``MissedTriggerDetector``)
+missed: triggers without a sample of this device, by its time or the arrivals
 least_missed: the least number of them that the arrivals show; 0 = none do
 lost, gaps: trigger counts that never arrived, and in how many places
 restarts: how often the device's counter or clock fell back
@@ -83,7 +83,7 @@ class StreamDevice:
         self._settings = settings
         self._now_ns = now_ns
         self._monotonic = monotonic
-        self._tracker = SequenceTracker(counting)
+        self._tracker = SequenceTracker(counting, settings.sample_period, settings.pause)
         self._small_counter = counting.modulus if counting.modulus <= _SMALL_COUNTER else 0
         self._cutter = BlockCutter(settings, channels, counting.period > 0)
         self._identity: dict[str, str] = {}
@@ -269,6 +269,7 @@ class StreamDevice:
         """Return the counts of all samples."""
         owners = (self, self._tracker, self._cutter, self._cutter.detector)
         found = {n: next((getattr(o, n) for o in owners if hasattr(o, n)), 0) for n in _COUNTS}
+        found["missed"] += self._tracker.missed_by_time
         return SimpleNamespace(**found)
 
     def counts(self) -> dict[str, float]:

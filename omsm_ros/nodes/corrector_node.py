@@ -112,7 +112,12 @@ class CorrectionState:
         for name, counts in self.outside.items():
             report.values |= {f"{stream}_{name}": counts[stream] for stream in _STREAMS}
         report.values |= {f"begins_at_{name}": first for name, first in self.begins_at.items()}
-        self._add_starved(report, now)
+        for stream, flow in self._flows.items():
+            flow.update(self._heard[stream], now)
+            report.values[f"rate_hz_{stream}"] = round(flow.rate, 3)
+            none = f"no sample of {stream}"
+            silent, period = flow.silent(now), self._period[stream]
+            report.add_silence(silent, period, f"{none} for {{:.0f}} s", f"{none} yet")
         if corrector is None:
             report.add(WARN, "no calibration: nothing is published")
             return report
@@ -166,22 +171,12 @@ class CorrectionState:
             text = ", ".join(f"{name} {rise:.0f}" for name, rise in rises.items())
             report.add(WARN, f"just now: {text}")
 
-    def _add_starved(self, report: StateReport, now: float) -> None:
-        for stream, flow in self._flows.items():
-            flow.update(self._heard[stream], now)
-            report.values[f"rate_hz_{stream}"] = round(flow.rate, 3)
-            none = f"no sample of {stream}"
-            silent, period = flow.silent(now), self._period[stream]
-            report.add_silence(silent, period, f"{none} for {{:.0f}} s", f"{none} yet")
-
 
 def _add_motion(report: StateReport, slip: TriggerSlip, motion: LiveOffset) -> None:
     """Enter the counter offset estimated from a motion, and compare it with the stamps."""
     offset = motion.established
-    report.values["motion_offset_samples"] = None if offset is None else offset.samples
-    if offset is None:
-        return
-    if offset.samples:
+    report.values["motion_offset_samples"] = offset and offset.samples
+    if offset and offset.samples:
         report.add(
             ERROR,
             f"the motion shows that the counts are {offset.samples} samples apart (± "
@@ -189,7 +184,7 @@ def _add_motion(report: StateReport, slip: TriggerSlip, motion: LiveOffset) -> N
             f"counter_offset {motion.in_use + offset.samples}, or identify again if "
             "the lag changed",
         )
-    elif slip.samples:
+    elif offset and slip.samples:
         report.add(ERROR, "but the motion shows that equal counts are one trigger: a link is late")
 
 

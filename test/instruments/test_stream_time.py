@@ -124,6 +124,57 @@ def test_another_rate_is_seen_in_large_portions_too() -> None:
     assert "2000 Hz" in device.trouble
 
 
+@pytest.mark.parametrize("together", [1, 7, 300])
+@pytest.mark.parametrize(
+    ("passed", "missed"), [(3.0, 2), (3.01, 0), (2.5, 0), (30.4, 0), (101.0, 100), (102.0, 0)]
+)
+def test_whole_periods_of_time_are_missed_triggers(
+    together: int, passed: float, missed: int
+) -> None:
+    """A pause of the trigger has any length, and a longer one than half of ``pause`` is one."""
+    frames = frames_of(np.arange(300))
+    frames["device_time"][100:] += round((passed - 1) * MS)
+    settings = StreamSettings(block_size=10, pause=0.2)
+    wire = [encode_frames(frames[i : i + together]) for i in range(0, 300, together)]
+    found, device = run(*wire, settings=settings)
+    numbers = np.concatenate([axes.first_sample + np.arange(len(axes)) for axes, _ in found])
+    counts = np.concatenate([np.rint(axes.x * 1e9).astype(int) for axes, _ in found])
+    np.testing.assert_array_equal(numbers, np.arange(300) + missed * (np.arange(300) >= 100))
+    np.testing.assert_array_equal(counts, np.arange(300))
+    assert (device.statistics.missed, device.statistics.lost) == (missed, 0)
+
+
+def test_a_damaged_time_is_no_missed_trigger() -> None:
+    frames = frames_of(np.arange(300))
+    frames["device_time"][100] += 2 * MS
+    found, device = run(*(encode_frames(frames[i : i + 1]) for i in range(300)))
+    assert sum(len(axes) for axes, _ in found) == 300
+    assert device.statistics.missed == 0
+
+
+@pytest.mark.parametrize("grain", [1000, 10_000])
+def test_the_scatter_of_its_times_decides_what_a_device_can_show(grain: int) -> None:
+    """At 70 kHz times in steps of 1 µs show a missed trigger, and those of 10 µs do not."""
+    frames = frames_of(np.arange(300))
+    true = np.arange(300) + 2 * (np.arange(300) >= 100)
+    frames["device_time"] = true * 1e9 / 70e3 // grain * grain
+    settings = StreamSettings(block_size=10, sample_period=1 / 70e3)
+    _, device = run(encode_frames(frames), settings=settings)
+    assert device.statistics.missed == (2 if grain == 1000 else 0)
+
+
+def test_times_of_sending_show_no_missed_trigger() -> None:
+    """A device that now and then sends up to three samples late, with the times of sending."""
+    random = np.random.default_rng(1)
+    frames = frames_of(np.arange(4000))
+    late = np.zeros(4000)
+    for at in random.integers(40, 3900, 200):
+        late[at : at + random.integers(1, 4)] = random.uniform(0.0, 3.0)
+    frames["device_time"] = np.rint((np.arange(4000) + late) * MS)
+    _, device = run(encode_frames(frames))
+    assert device.statistics.missed == 0
+
+
 # Connection.
 
 

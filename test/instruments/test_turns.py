@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.instruments.counting import Turns
+from omsm_ros.instruments.scaling import Turns
 
 WRAP = 2**32
 RNG = np.random.default_rng(8)

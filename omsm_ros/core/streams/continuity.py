@@ -81,11 +81,10 @@ class TriggerCount:
     def _leaps(self, block: Block) -> bool:
         """Return whether the count is ahead of the time, and of the last block that was ahead."""
         assert self._newest_stamp_ns is not None  # of a session that has begun
-        if not is_ahead_of_time((self._newest_first, self._newest_stamp_ns), block):
-            return False
+        ahead = is_ahead_of_time((self._newest_first, self._newest_stamp_ns), block)
         if not self._jumped or block.first_sample <= self._jumped[-1][0]:
-            return True
-        return is_ahead_of_time(self._jumped[-1][:2], block)
+            return ahead
+        return ahead and is_ahead_of_time(self._jumped[-1][:2], block)
 
     def _filled(self, first: int, end: int) -> int:
         """Remove the counts ``first`` to ``end`` from the gaps; return how many there were."""

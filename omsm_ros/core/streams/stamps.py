@@ -175,9 +175,8 @@ class StampLine:
 
     def next_in(self, session: int, end: int) -> int:
         """Return the count at which the next block begins, at most ``end``."""
-        if self._coming and self._coming[0][0] == session:
-            return min(self._coming[0][1], end)
-        return end
+        coming = self._coming and self._coming[0][0] == session
+        return min(self._coming[0][1], end) if coming else end
 
     def stamp_of(self, session: int, count: int, period_ns: float) -> float | None:
         """Return the time of the sample ``count`` [ns], None where no stamp is known."""
@@ -227,10 +226,6 @@ class StampHistory:
             self._held = self._most
         self._room[self._held] = row
         self._held += 1
-
-    def after(self, count: float) -> FloatArray:
-        """Return the rows beyond a count."""
-        return self.rows[np.searchsorted(self.rows[:, 0], count, "right") :]
 
     def recent(self, first: float, since: float, least: int) -> FloatArray | None:
         """Return the rows from the count ``since`` on, with at least ``least`` blocks a stream.

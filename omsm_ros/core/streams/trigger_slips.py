@@ -46,8 +46,6 @@ _FIRST_S = 1.0
 _SPAN_S, _STRIDE_S = 0.8, 0.2
 # Stamps of each stream that a verdict needs; those of long blocks span more than a second.
 _LEAST_STAMPS = 8
-# Stamps at the end of a stream that show a slip; fewer refuse their own pairs only.
-_SURE_STAMPS = 3
 # Time over which the scatter is also taken: the window of a driver's clock [s].
 _WANDER_S = 30.0
 # Stamps kept for a median; single-sample blocks at 1 kHz make 800 in a span.
@@ -154,8 +152,7 @@ class TriggerSlipDetector:
         self._judged, self._since, self._period_ns = -1, 0.0, 1.0
         self._starting, self.same_stamps = True, False  # until the first verdict
         self.in_doubt = False
-        # Per stream: number of stamps, and the last block that began where stamps agree.
-        self._stamps, self._shown = [0, 0], [first, first]
+        self._shown = [first, first]  # per stream: the last block that began where stamps agree
         # Count up to which a verdict found no slip; last count with a stamp that is off.
         self._judged_to, self._odd_at = first, -math.inf
         # True if any stamp since the last verdict is off; otherwise the median is not.
@@ -215,15 +212,14 @@ class TriggerSlipDetector:
     def end(self) -> bool:
         """Return whether the pairs that still wait slipped, as far as their stamps show."""
         since = self._start - 1 if self._starting else min(self._shown)
-        few = self._starting and min(self._stamps) < _LEAST_STAMPS
-        known = self._state.samples or self._odd_at <= since or few
+        known = self._state.samples or self._odd_at <= since
         if known or not self._seen.stamps_follow_counts(self._period_ns):
             return bool(self._state.samples)
-        rows = self._seen.after(since)
-        found = self._verdict(rows[:, 1] / self._period_ns)
-        if found.samples and len(rows) >= _SURE_STAMPS:
-            self._state = self.found = found
-        return bool(found.samples) or (self._starting and self._may_be_slip(rows[:, 1]))
+        rows = self._seen.rows[self._seen.rows[:, 0] > since]
+        # As after ten seconds, a skew at the start that may be that of a slip is one.
+        found = self._verdict(rows[:, 1] / self._period_ns, 0.0 if self._starting else None)
+        self.found = found if found.samples else self.found
+        return bool(found.samples)
 
     def _agreed_until(self, count: int, period_ns: float) -> int:
         """Return the count up to which stamps have shown that there is no slip."""
@@ -237,11 +233,6 @@ class TriggerSlipDetector:
     def _overdue(self, count: int) -> bool:
         return (count - self._start) * self._period_ns > _MOST_WAIT_S * NANOSECONDS_PER_S
 
-    def _may_be_slip(self, skew: FloatArray) -> bool:
-        """Return whether ``skew`` (n,) [ns] may be that of a slip that was not found."""
-        beyond = abs(median(skew)) >= self._steady() * self._period_ns
-        return beyond and not self._state.samples
-
     def _observe(self, count: int, period_ns: float) -> None:
         """Take the skew at ``count``, where a block of either stream begins."""
         (axes, distance), (a, d) = self._lines, self.sessions
@@ -253,10 +244,9 @@ class TriggerSlipDetector:
         self._period_ns, per_s = period_ns, NANOSECONDS_PER_S / period_ns
         changed = abs(skew - self._usual) >= period_ns / 2  # False while none is usual
         off = (changed or abs(skew) >= period_ns / 2) and bool(self._off(np.array(skew)))
-        first = not any(self._stamps)
-        self.same_stamps = abs(skew) <= _SAME_NS and (first or self.same_stamps)
+        self.same_stamps |= not len(self._seen.rows)  # the first one
+        self.same_stamps &= abs(skew) <= _SAME_NS
         for stream in (0, 1):
-            self._stamps[stream] += begun[stream]
             if begun[stream] and not off:
                 self._shown[stream] = count
         self._odd_at = count if off else self._odd_at
@@ -294,7 +284,8 @@ class TriggerSlipDetector:
                 self._starting, self._judged_to = False, count  # stamps show nothing
         else:
             self._state = self._verdict(rows[:, 1] / self._period_ns)
-            self.in_doubt = self._starting and self._may_be_slip(rows[:, 1])
+            beyond = abs(median(rows[:, 1])) >= self._steady() * self._period_ns
+            self.in_doubt = self._starting and beyond and not self._state.samples
             if self.in_doubt and not self._overdue(count):
                 return
             if self.in_doubt:

@@ -39,7 +39,7 @@ from omsm_ros.instruments.chrocodile.telegram import (
 )
 from omsm_ros.instruments.counting import SAMPLE, Counting, Samples
 from omsm_ros.instruments.parameters import Values, axes_of, block_settings, probe_reading_of
-from omsm_ros.instruments.scaling import AxisScaling, ProbeReading
+from omsm_ros.instruments.scaling import AxisScaling, ProbeReading, encoder_places
 from omsm_ros.instruments.stream import StreamDevice
 from omsm_ros.instruments.transport import Patience, Transport
 from omsm_ros.units import MICROMETRE_M
@@ -374,7 +374,7 @@ def settings_from(values: Values) -> ChrocodileSettings:
         **block_settings(values),
         signals=_numbers("signals", values["signals"]),
         axes=tuple(axes_of(values).values()) if values["encoders"] else None,
-        encoders=_encoders(values["encoders"] or "XYZUV"),
+        encoders=encoder_places(values["encoders"] or "XYZUV", "XYZUV", 5),
         latch=values["latch"],
         trigger=values["trigger"],
         format=values["format"],
@@ -392,12 +392,3 @@ def _numbers(name: str, text: str) -> tuple[int, ...]:
         return tuple(int(word) for word in text.replace(",", " ").split())
     except ValueError as err:
         raise ConfigurationError(f"{name} {text!r}, expected numbers, like '83 256 257'") from err
-
-
-def _encoders(text: str) -> tuple[int, ...]:
-    letters = "XYZUV"
-    if sorted(text.upper()) != sorted(letters):
-        raise ConfigurationError(
-            f"encoders {text!r}, expected the letters {letters} in the order of X, Y, Z, B, C"
-        )
-    return tuple(letters.index(letter) for letter in text.upper())

@@ -41,7 +41,7 @@ from omsm_ros.instruments.parameters import (
     command_transport,
     probe_reading_of,
 )
-from omsm_ros.instruments.scaling import AxisScaling, ProbeReading
+from omsm_ros.instruments.scaling import AxisScaling, ProbeReading, encoder_places
 from omsm_ros.instruments.stream import UNREADABLE_S, StreamDevice
 from omsm_ros.instruments.transport import CommandPort, Patience, Transport
 from omsm_ros.units import NANOMETRE_M
@@ -388,7 +388,7 @@ def make_ethernet(values: Values, transport: Transport, now_ns: NowNs) -> Confoc
     """Return the device that ``values`` describe, over Ethernet."""
     wired = values["encoders"].lower()
     axes = tuple(axes_of(values, wired).values()) if wired else None
-    settings = _settings(values, axes=axes, wired=_wired(values["encoders"]))
+    settings = _settings(values, axes=axes, wired=encoder_places(values["encoders"], "XYZBC"))
     commands = command_transport(values["port"], values["command_port"])
     return ConfocalDtEthernetDevice(transport, settings, now_ns, commands=commands)
 
@@ -396,10 +396,3 @@ def make_ethernet(values: Values, transport: Transport, now_ns: NowNs) -> Confoc
 def _settings(given: Values, **more: Any) -> ConfocalDtSettings:
     common = block_settings(given) | {"trigger": given["trigger"]}
     return ConfocalDtSettings(**common, probe=probe_reading_of(given), **more)
-
-
-def _wired(text: str) -> tuple[int, ...]:
-    letters = "XYZBC"
-    if len(set(text.upper())) < len(text) or set(text.upper()) - set(letters):
-        raise ConfigurationError(f"encoders {text!r}, expected some of the letters {letters}")
-    return tuple(letters.index(letter) for letter in text.upper())

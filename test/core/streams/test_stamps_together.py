@@ -108,4 +108,3 @@ def test_a_history_holds_the_last_rows_in_their_order() -> None:
     for end, row in enumerate(rows, start=1):
         history.add(*row)
         assert np.array_equal(history.rows, rows[max(end - 10, 0) : end])
-    assert np.array_equal(history.after(rows[95, 0]), rows[96:])
